@@ -18,19 +18,19 @@ ROW = "faults"
 COLUMNS = ("cases", "refused in one line", "right", "found by a second run")
 MARKS = ("<!-- faults: begin -->", "<!-- faults: end -->")
 SHARE = float(os.environ.get("DMRL_FAULTS", "1"))
-"""Of the cases that the slow tests try. 0.1 on a machine that has little time."""
+"""Share of the cases that the slow tests try. 0.1 is enough for a slow machine."""
 SEED = int(os.environ.get("DMRL_FAULTS_SEED", "2"))
-"""Of the mutated recordings: another one tries others."""
+"""Seed of the mutated recordings. Another seed tries other mutations."""
 
 
-def cases_of(most: int) -> int:
-    """How many of them are tried."""
+def scale_cases(most: int) -> int:
+    """Return the number of cases to try, of ``most`` in a full run."""
     return max(1, round(SHARE * most))
 
 
 @pytest.fixture(scope="module")
 def disk(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Disk]:
-    """A disk that fails, and a process that has loaded what is run on it."""
+    """Return a disk that fails on demand, with the process that runs commands on it."""
     disk = Disk(tmp_path_factory.mktemp("disk"))
     yield disk
     disk.close()
@@ -38,7 +38,7 @@ def disk(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Disk]:
 
 @pytest.fixture
 def count(request: pytest.FixtureRequest) -> Count:
-    """Adds to a row of the table: ``count("row", cases=1, refused=1)``."""
+    """Return a function that adds to a row of the table: ``count("row", cases=1, refused=1)``."""
 
     def add(row: str, **counts: int) -> None:
         request.node.user_properties.append((ROW, [row, counts]))
@@ -64,7 +64,7 @@ def pytest_terminal_summary(terminalreporter: Any) -> None:
 
 
 def join_commands(rows: dict[str, Counter[str]]) -> dict[str, Counter[str]]:
-    """Add up the rows of one kind of fault, named ``KIND: COMMAND``, and list the commands."""
+    """Sum the rows ``KIND: COMMAND`` of one kind of fault, and list the commands in its name."""
     kinds: dict[str, Counter[str]] = {}
     commands: dict[str, list[str]] = {}
     for row, counts in sorted(rows.items()):
@@ -87,7 +87,7 @@ def format_table(rows: dict[str, Counter[str]]) -> str:
 
 
 def write_table(page: Path, table: str, failed: int) -> None:
-    """Replace the table between the marks of a page, with the command and version above it."""
+    """Replace the table between the marks of a page; note the command and version above it."""
     git = ["git", "rev-parse", "--short", "HEAD"]
     version = subprocess.run(git, capture_output=True, text=True, check=True).stdout.strip()
     note = (

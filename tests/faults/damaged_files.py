@@ -1,4 +1,4 @@
-"""Read damaged third-party files, in children of the process of server.py."""
+"""Use damaged third-party files, in child processes of server.py."""
 
 import shutil
 from collections.abc import Callable
@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from .ending import ended
-from .mutate import mutated
+from .ending import run_to_end
+from .mutate import mutate
 from .workloads import Inputs, cli
 
 Use = Callable[[Inputs, Path, Path], None]
@@ -16,16 +16,16 @@ Use = Callable[[Inputs, Path, Path], None]
 
 @dataclass(frozen=True, slots=True)
 class Source:
-    """A file or folder of a stranger.
+    """A third-party file or folder, and a command that reads it.
 
     Parameters
     ----------
     made
-        A sound one.
+        Returns an undamaged one.
     file
-        Pattern of the file in it that is damaged.
+        Pattern of the file to damage in a folder.
     use
-        What reads it: inputs, source, and a path to write to.
+        Runs the command, given the inputs, the source, and a path to write to.
     """
 
     made: Callable[[Inputs], Path]
@@ -57,7 +57,7 @@ def _render(i: Inputs, source: Path, out: Path) -> None:
     cli("render", source, out)
 
 
-def _seen_by(i: Inputs, source: Path, out: Path) -> None:
+def _render_with_camera(i: Inputs, source: Path, out: Path) -> None:
     cli("render", i.scene, out, "--camera", source, "--images", 1)
 
 
@@ -70,7 +70,7 @@ SOURCES: dict[str, Source] = {
     "labels of pictures": Source(lambda i: i.pictures, "*.csv", _convert),
     "a recipe of a pipeline": Source(lambda i: i.chain, "", _run),
     "a recipe of renders": Source(lambda i: i.scene, "", _render),
-    "a camera": Source(lambda i: i.camera, "", _seen_by),
+    "a camera": Source(lambda i: i.camera, "", _render_with_camera),
     "a recording that is judged": Source(lambda i: i.found, "", _evaluate),
     "a model's description": Source(lambda i: i.model, "model.json", _predict),
     "a model's weights": Source(lambda i: i.model, "*.safetensors", _predict),
@@ -85,20 +85,20 @@ SOURCES: dict[str, Source] = {
 }
 
 
-def begin(inputs: Inputs, name: str, folder: str) -> int:
-    """Copy a sound source into the folder, and use it: the exit status."""
+def use_sound_source(inputs: Inputs, name: str, folder: str) -> int:
+    """Copy an undamaged source into the folder and use it; return the exit status, 0."""
     place, source = Path(folder), SOURCES[name]
     sound = source.made(inputs)
     copy = place / sound.name
     shutil.copytree(sound, copy) if sound.is_dir() else shutil.copy(sound, copy)
-    status, output = ended(lambda: source.use(inputs, copy, _out(place)))
+    status, output = run_to_end(lambda: source.use(inputs, copy, _get_output(place)))
     assert status == 0, output
-    _clear(_out(place).parent)
+    _empty(_get_output(place).parent)
     return status
 
 
-def damage(inputs: Inputs, name: str, folder: str, seed: int, cases: int) -> int:
-    """Damage it again and again, and use it: how often it was refused."""
+def use_damaged_sources(inputs: Inputs, name: str, folder: str, seed: int, cases: int) -> int:
+    """Damage and use a source this many times; return how often it was refused."""
     place, source, rng = Path(folder), SOURCES[name], np.random.default_rng(seed)
     sound = source.made(inputs)
     whole = sound if sound.is_file() else next(iter(sorted(sound.glob(source.file))))
@@ -106,27 +106,27 @@ def damage(inputs: Inputs, name: str, folder: str, seed: int, cases: int) -> int
     file = copy / whole.relative_to(sound) if sound.is_dir() else copy
     data, refused = whole.read_bytes(), 0
     for k in range(cases):
-        damaged = mutated(data, rng)
+        damaged = mutate(data, rng)
         file.write_bytes(damaged)
         try:
-            status, output = ended(lambda: source.use(inputs, copy, _out(place)))
+            status, output = run_to_end(lambda: source.use(inputs, copy, _get_output(place)))
             assert status in (0, 1, 2), status
-            assert (status == 0) == _out(place).exists() or name.endswith("judged"), output
+            assert (status == 0) == _get_output(place).exists() or name.endswith("judged"), output
         except BaseException as e:
             kept = place / f"found-{seed}-{k}{file.suffix}"
             kept.write_bytes(damaged)
             raise AssertionError(f"{name}, seed {seed}, case {k}, {kept}: {e}") from e
         assert file.read_bytes() == damaged
         refused += status != 0
-        _clear(_out(place).parent)
+        _empty(_get_output(place).parent)
     file.write_bytes(data)
     return refused
 
 
-def _out(place: Path) -> Path:
+def _get_output(place: Path) -> Path:
     return place / "out" / "a.mcap"
 
 
-def _clear(folder: Path) -> None:
+def _empty(folder: Path) -> None:
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir()

@@ -1,8 +1,8 @@
-/* A disk that fails, or a process that dies, at one operation.
+/* Let one disk operation fail, or kill the process there.
  *
- * Loaded before every other library (LD_PRELOAD), it stands between a process and the system:
- * Python, Arrow, torch, rerun and the processes they start all come by. What is counted, what
- * fails and how is said in a file that all processes and the test map, see disk.py.
+ * LD_PRELOAD loads this library before every other one, so it sees the file operations of Python,
+ * Arrow, torch, rerun and the processes they start. A file that all processes and the test map says
+ * what to count, which operation fails and how; see disk.py.
  */
 #define _GNU_SOURCE
 #include <dlfcn.h>
@@ -22,11 +22,11 @@
 
 struct orders {
     int64_t count;      /* operations below the folder so far */
-    int64_t fail_at;    /* number of the one that fails, from 0; below 0: none */
+    int64_t fail_at;    /* number of the operation that fails, from 0; below 0: none */
     int32_t error;      /* errno; 0: the process is killed */
-    int32_t stays;      /* whether the disk fails from there on */
-    char folder[1024];  /* empty: nothing is counted */
-    char failed[1024];  /* what failed first */
+    int32_t stays;      /* whether all later operations fail too */
+    char folder[1024];  /* where to count; empty: nowhere */
+    char failed[1024];  /* the first operation that failed */
 };
 
 static struct orders *orders;
@@ -51,7 +51,7 @@ static int mine(const char *path)
     return length && strncmp(path, orders->folder, length) == 0;
 }
 
-/* Whole path of a name in an open folder. */
+/* Return the full path of a name in an open folder. */
 static const char *whole(int folder, const char *path, char *into, size_t size)
 {
     if (path == NULL || path[0] == '/')
@@ -85,7 +85,7 @@ static int fails_now(const char *what, const char *path)
     return 1;
 }
 
-/* Whether an operation fails. `changes`: it is one that a full or read-only disk refuses. */
+/* Return whether an operation fails. `changes`: a full or read-only disk would refuse it. */
 static int fails(const char *what, int folder, const char *path, int changes)
 {
     char into[4096];
@@ -106,7 +106,7 @@ static int fails_on(const char *what, int held)
     return fails(what, held, "", 1);
 }
 
-/* Removing counts for nothing, but a broken disk refuses that as well. */
+/* Return whether the disk refuses to remove a file. Removing is not counted as an operation. */
 static int keeps(int folder, const char *path)
 {
     char into[4096];
@@ -160,7 +160,7 @@ FILE *fopen64(const char *path, const char *mode)
     return fopen(path, mode);
 }
 
-/* A disk that fills up takes the first part of what is written, then nothing. */
+/* Return how many bytes a disk that fills up still takes of a write: half of them. */
 static size_t part(int held, size_t size)
 {
     if (orders == NULL || !orders->stays || orders->error != ENOSPC || size < 2)
@@ -225,7 +225,7 @@ int fdatasync(int held)
     return fails_on("fdatasync", held) ? -1 : (int)syscall(SYS_fdatasync, held);
 }
 
-/* A network disk reports at the end that it could not write; the file is closed all the same. */
+/* A network disk may report a failed write only on close; the file is closed anyway. */
 int close(int held)
 {
     int writes = (fcntl(held, F_GETFL) & O_ACCMODE) != O_RDONLY;

@@ -1,7 +1,7 @@
-"""Commands run in children of one process with everything loaded, on a disk that can fail.
+"""Run commands on a disk that can fail, in children of one process that has all modules loaded.
 
-The process is started once with disk.c before all libraries, and forks for each command: a trial
-takes no longer than the command's own work. Processes that a command starts are on the same disk.
+The process is started once, with disk.c preloaded, and forks for each command. So a trial takes no
+longer than the command's own work. Processes that a command starts are on the same disk.
 """
 
 import ctypes
@@ -22,7 +22,7 @@ from typing import Any
 
 REFUSALS = (errno.ENOSPC, errno.EIO, errno.EROFS, errno.EFBIG, errno.EINTR)
 KILL = 0
-"""In place of an errno: the process dies there."""
+"""Stands for an errno: the process is killed at that operation."""
 TESTS = Path(__file__).parents[1]
 START = """
 import sys, types
@@ -35,7 +35,7 @@ main(sys.argv[2])
 
 
 class Orders(ctypes.Structure):
-    """As in disk.c."""
+    """The struct of disk.c, in memory that all processes share."""
 
     _fields_ = (
         ("count", ctypes.c_int64),
@@ -47,7 +47,7 @@ class Orders(ctypes.Structure):
     )
 
     def order(self, folder: Path, fault: "Fault | None") -> None:
-        """From now on operations below a folder count, and one fails."""
+        """Start to count operations below a folder, and let one fail."""
         self.count, self.failed = 0, b""
         self.fail_at = -1 if fault is None else fault.at
         self.error = 0 if fault is None else fault.error
@@ -55,22 +55,22 @@ class Orders(ctypes.Structure):
         self.folder = os.fsencode(folder) + b"/"
 
     def rest(self) -> None:
-        """Nothing counts, nothing fails."""
+        """Stop counting operations and let none fail."""
         self.folder, self.fail_at = b"", -1
 
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """What goes wrong, where.
+    """An operation that fails, and how.
 
     Parameters
     ----------
     at
-        Number of the operation that fails, from 0.
+        Number of the operation, from 0.
     error
-        What the system says, an errno; or `KILL`.
+        The errno that the operation returns, or `KILL`.
     stays
-        Whether the disk fails from there on, or once.
+        Whether all later operations fail too.
     """
 
     at: int
@@ -84,9 +84,9 @@ class Fault:
 
 @dataclass(frozen=True, slots=True)
 class Ending:
-    """How a command ended: exit status, or a signal's number below 0; its last line of error.
+    """The end of a command: its exit status, or minus the signal's number, and last error line.
 
-    ``operations`` came to the disk, ``failed`` is the one that did not pass.
+    ``operations`` counts those on the disk, ``failed`` names the one that failed.
     """
 
     status: int
@@ -97,12 +97,12 @@ class Ending:
 
 
 class Disk:
-    """A disk below a folder, and a process that runs commands on it.
+    """A process that runs commands, and lets operations below a folder fail.
 
     Parameters
     ----------
     folder
-        Operations elsewhere go through. For a log, and what is compiled.
+        Folder for the inputs, a log, and the compiled disk.c.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -139,27 +139,27 @@ class Disk:
         kill_s: float | None = None,
         most_bytes: int | None = None,
     ) -> Ending:
-        """Run a work of `works.WORKLOADS` in a process of its own.
+        """Run a workload of `workloads.WORKLOADS` in a process of its own.
 
         Parameters
         ----------
         work
-            Its name.
+            Name of the workload.
         folder
             The disk that fails; the output goes there.
         out
             Name of the output.
         fault
-            What goes wrong. None: nothing.
+            The operation that fails. None: no operation fails.
         kill_s
-            Kill it after so many seconds.
+            Kill the process after this time, seconds.
         most_bytes
-            The kernel lets no file grow beyond.
+            The kernel lets no file grow beyond this size, bytes.
 
         Raises
         ------
         AssertionError
-            If it ended with a traceback, with more than a line of error, or not at all.
+            If it ends with a traceback, prints more than one line of error, or hangs.
         """
         given = {"work": work, "out": str(folder / out), "most_bytes": most_bytes}
         self.orders.order(folder, fault)
@@ -171,23 +171,26 @@ class Disk:
         return Ending(status, said, self.orders.count, failed, answer["seconds"])
 
     def prepare(self, work: str, folder: Path, out: str) -> None:
-        """Make what has to be there before a work."""
+        """Make what a workload needs before it starts."""
         self.call("server:prepare_work", work=work, out=str(folder / out))
 
     def call(self, call: str, **given: Any) -> Any:
-        """What a function gives that does not fail.
+        """Call a function ``module:name`` of these tests in a child, and return its result.
 
         Raises
         ------
         AssertionError
-            If it did, or did not end.
+            If it raises or hangs.
         """
         answer = self.ask(call, **given)
         assert "fault" not in answer, answer["fault"]
         return answer["value"]
 
     def ask(self, call: str, *, kill_s: float | None = None, **given: Any) -> dict[str, Any]:
-        """What a function of these tests gives, ``module:name``, in a child of the process."""
+        """Call a function ``module:name`` of these tests in a child; return the child's answer.
+
+        It has the result as "value", or the traceback as "fault".
+        """
         told = {"call": call, "kill_s": kill_s, "given": given}
         assert self._process.stdin is not None and self._process.stdout is not None
         self._process.stdin.write(json.dumps(told).encode() + b"\n")
@@ -208,8 +211,8 @@ class Disk:
 
 
 @contextmanager
-def small_files(size: int | None) -> Iterator[None]:
-    """The kernel lets no file of this process grow beyond ``size`` bytes: EFBIG."""
+def limit_file_size(size: int | None) -> Iterator[None]:
+    """Limit the size of every file that this process writes, bytes; beyond it, EFBIG."""
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     if size is not None:
         signal.signal(signal.SIGXFSZ, signal.SIG_IGN)

@@ -1,4 +1,4 @@
-"""Possible endings of a command."""
+"""Run a command and check that it ends without a bug."""
 
 import io
 from collections.abc import Callable
@@ -7,15 +7,17 @@ from contextlib import nullcontext, redirect_stderr, redirect_stdout
 from dmrl.boundary import run_to_status
 
 
-def ended(work: Callable[[], object], *, mute: bool = False) -> tuple[int, str]:
-    """Exit status and last words of a command; never a bug, never more than one line of error.
+def run_to_end(work: Callable[[], object], *, mute: bool = False) -> tuple[int, str]:
+    """Run a command; return its exit status and its error line, or an empty text.
+
+    Assert that it prints no traceback, and exactly one line of error if the status is not 0.
 
     Parameters
     ----------
     work
         The command.
     mute
-        Standard output stays as it is, which takes nothing.
+        Whether standard output is closed or full, and so must not be replaced.
     """
     said = io.StringIO()
     with redirect_stderr(said), nullcontext() if mute else redirect_stdout(io.StringIO()):

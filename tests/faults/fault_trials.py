@@ -1,4 +1,4 @@
-"""Inject faults into one workload again and again, and count the results."""
+"""Inject faults into one workload repeatedly, and count the results."""
 
 import errno
 import time
@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import Protocol
 
 from .disk import REFUSALS, Ending, Fault
-from .workloads import Workload, clear, contents
+from .workloads import Workload, clear_folder, read_contents
 
 STAYING = (errno.ENOSPC, errno.EIO, errno.EROFS)
-"""Of these every second stays: the disk is full, broken or read-only from there on."""
-PATIENCE_S = 30.0
+"""Errors that persist in every second trial: the disk stays full, broken or read-only."""
+RETRY_S = 30.0
 
 
 class Runner(Protocol):
@@ -47,8 +47,8 @@ class FaultTrials:
     inputs
         A folder that no workload may change.
     times
-        How often it is run without faults: twice, where the first makes the inputs, and loads what
-        the command imports.
+        Number of runs without faults. The first of two makes the inputs and loads the modules, so
+        the second counts only the workload's own operations.
     """
 
     def __init__(
@@ -60,17 +60,17 @@ class FaultTrials:
         self.wrong: list[str] = []
         for _ in range(times):
             self.clear()
-            self.before = contents(self.out) if self.out.exists() else {}
+            self.before = read_contents(self.out) if self.out.exists() else {}
             self.found = [self.read()]
             self.sound = self.run()
         assert self.sound.status == 0, self.wrong or self.sound.said
-        self.whole = contents(self.out)
+        self.whole = read_contents(self.out)
         self.found.append(self.read())
-        self._inputs = (inputs, contents(inputs))
+        self._inputs = (inputs, read_contents(inputs))
 
-    def clear(self) -> None:
+    def clear_folder(self) -> None:
         """Restore the disk to its first state."""
-        clear(self.folder)
+        clear_folder(self.folder)
         if self.work.before:
             self.disk.prepare(self.work.name, self.folder, self.work.out)
 
@@ -94,7 +94,7 @@ class FaultTrials:
             return Ending(1, "a bug", 0, "", 0.0)
 
     def break_at(self, operations: range, *, quick: bool = False) -> None:
-        """Each of these operations fails with every error; ``quick``: with the next in turn."""
+        """Let each of these operations fail with every error; ``quick``: with one, in turn."""
         for k in operations:
             for number, error in enumerate(REFUSALS):
                 again = number == k % len(REFUSALS)
@@ -109,9 +109,9 @@ class FaultTrials:
 
     @property
     def done(self) -> bool:
-        """Whether the output stands, and is what it should be."""
-        found = contents(self.out) if self.out.exists() else {}
-        # Cut off between its two names, a file keeps both.
+        """Whether the output is complete: the same bytes as without faults, if the workload has."""
+        found = read_contents(self.out) if self.out.exists() else {}
+        # Killed between linking a file and removing its partial name, it has both names.
         twins = {name for name in found if found.get(f"{name}.partial") == found[name]}
         found = {
             n: data
@@ -124,11 +124,11 @@ class FaultTrials:
         return abs(sizes[0] - sizes[1]) < 0.1 * sizes[1]
 
     def refuse_half(self, why: object) -> None:
-        """Nothing, if what stands under its final name is whole."""
+        """Assert that no incomplete output has its final name."""
         if not self.out.exists() or self.done:
             return
         assert self.work.pieces, f"{why}: half an output under its final name"
-        for name, data in contents(self.out).items():
+        for name, data in read_contents(self.out).items():
             unfinished = any(part.endswith(".partial") for part in Path(name).parts)
             wanted = (self.whole.get(name), self.before.get(name))
             assert unfinished or data in wanted, f"{why}: half of {name}"
@@ -136,7 +136,7 @@ class FaultTrials:
             assert found in [known[who] for known in self.found], f"{why}: {who} finds {found}"
 
     def judge(self, ending: Ending, why: str, *, may_stay: bool, again: bool) -> None:
-        """What came of a disturbance; then, or where anything is left of it, once more."""
+        """Check the result of a fault; run again if ``again`` is set or partial files are left."""
         self.cases += 1
         try:
             self._judge(ending, why, may_stay=may_stay, again=again)
@@ -159,11 +159,11 @@ class FaultTrials:
             self.run_again(why)
 
     def run_again(self, why: str) -> None:
-        """The second run gives the bytes of an undisturbed one."""
-        until = time.monotonic() + PATIENCE_S
+        """Assert that a second run gives the same output as one without faults."""
+        until = time.monotonic() + RETRY_S
         while True:
             ending = self.run()
-            # Steps of a pipeline that was killed end soon after it.
+            # The steps of a killed pipeline end soon after it, and then release the output.
             if "is being written by another" not in ending.said or time.monotonic() > until:
                 break
             time.sleep(0.05)
@@ -173,15 +173,15 @@ class FaultTrials:
         self.again += 1
 
     def add(self, cases: int, refused: int, right: int, again: int, wrong: list[str]) -> None:
-        """Count what was broken elsewhere."""
+        """Add the counts of trials in another process."""
         self.cases, self.refused = self.cases + cases, self.refused + refused
         self.right, self.again = self.right + right, self.again + again
         self.wrong += wrong
 
     def report(self, what: str, count: Callable[..., None]) -> None:
-        """A row of the table, if nothing was wrong."""
+        """Add the counts to the table; assert that no trial failed and no input changed."""
         assert not self.wrong, "\n".join(self.wrong)
         folder, before = self._inputs
-        assert contents(folder) == before, "an input was changed"
+        assert read_contents(folder) == before, "an input was changed"
         cells = {"cases": self.cases, "refused": self.refused, "right": self.right}
         count(f"{what}: {self.work.name}", **cells, found=self.again)

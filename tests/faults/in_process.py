@@ -1,4 +1,4 @@
-"""Inject faults into workloads in one process, one after the other: a child of server.py."""
+"""Inject faults into workloads one after the other, in a single child process of server.py."""
 
 import mmap
 import os
@@ -7,8 +7,8 @@ import time
 from pathlib import Path
 from typing import Any
 
-from .disk import Ending, Fault, Orders, small_files
-from .ending import ended
+from .disk import Ending, Fault, Orders, limit_file_size
+from .ending import run_to_end
 from .fault_trials import FaultTrials
 from .inputs import Inputs
 from .workloads import find_workload
@@ -48,8 +48,8 @@ class InProcess:
         run = find_workload(work).run
         self.orders.order(folder, fault)
         try:
-            with small_files(most_bytes):
-                status, output = ended(lambda: run(self.inputs, folder / out))
+            with limit_file_size(most_bytes):
+                status, output = run_to_end(lambda: run(self.inputs, folder / out))
         except AssertionError as e:
             raise AssertionError(f"{work}, {fault}: {e}") from e
         finally:
@@ -68,14 +68,14 @@ def break_at(
     inputs: Inputs, work: str, folder: str, first: int, last: int, quick: bool
 ) -> dict[str, Any]:
     """Let each of these operations of a workload fail; return the counts for `FaultTrials.add`."""
-    broken = FaultTrials(
+    trials = FaultTrials(
         find_workload(work), InProcess(inputs), Path(folder), inputs.folder, times=1
     )
-    broken.break_at(range(first, last), quick=quick)
+    trials.break_at(range(first, last), quick=quick)
     return {
-        "cases": broken.cases,
-        "refused": broken.refused,
-        "right": broken.right,
-        "again": broken.again,
-        "wrong": broken.wrong,
+        "cases": trials.cases,
+        "refused": trials.refused,
+        "right": trials.right,
+        "again": trials.again,
+        "wrong": trials.wrong,
     }

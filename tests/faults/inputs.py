@@ -1,4 +1,4 @@
-"""Inputs of every command, made once, as small as they can be."""
+"""Inputs of every command, each made once and as small as possible."""
 
 import pickle
 import shutil
@@ -37,7 +37,7 @@ STAND_INS = {
     "report": (("matplotlib.figure:Figure", "draw", "blank"),),
     "quantize": (("dmrl.evaluation.quantization_report:", "plots", "nothing"),),
 }
-"""By command: where, what, and the name in stand_ins.py of what takes its place."""
+"""By command: module or class, attribute to replace, and its substitute in stand_ins.py."""
 SHORT = """
 kind = "train"
 architecture = "locanet"
@@ -57,12 +57,12 @@ seed = 3
 
 @dataclass(frozen=True, slots=True)
 class Inputs:
-    """Whole inputs in one folder, each made when it is first asked for. No stage may change one."""
+    """Valid inputs in one folder, each made on first use. No stage may change one."""
 
     folder: Path
 
-    def made(self, name: str, make: Callable[[Path], object]) -> Path:
-        """The input of that name."""
+    def make_once(self, name: str, make: Callable[[Path], object]) -> Path:
+        """Return the input of this name; make it if it does not exist."""
         path = self.folder / name
         if not path.exists():
             make(path)
@@ -71,132 +71,142 @@ class Inputs:
     @property
     def dots(self) -> Path:
         """A recording of twelve small images with labels."""
-        return self.made("dots.mcap", _dots)
+        return self.make_once("dots.mcap", write_dots)
 
     @property
     def cut(self) -> Path:
-        """Two thirds of it."""
+        """The first two thirds of ``dots``, as a truncated file."""
         whole = self.dots.read_bytes()
-        return self.made("cut.mcap", lambda path: path.write_bytes(whole[: 2 * len(whole) // 3]))
+        return self.make_once(
+            "cut.mcap", lambda path: path.write_bytes(whole[: 2 * len(whole) // 3])
+        )
 
     @property
     def pictures(self) -> Path:
-        """Three sketches."""
-        return self.made("pictures", lambda path: cli("sketch", path, "--images", 3))
+        """A folder with three sketches."""
+        return self.make_once("pictures", lambda path: cli("sketch", path, "--images", 3))
 
     @property
     def flight(self) -> Path:
-        """Eight seconds of two robots."""
+        """A simulated flight of two robots for 8 s."""
         flags = "--duration-s", 8, "--seed", 1
-        return self.made("flight.mcap", lambda path: cli("fly", "fly_in_view", path, *flags))
+        return self.make_once("flight.mcap", lambda path: cli("fly", "fly_in_view", path, *flags))
 
     @property
     def moment(self) -> Path:
-        """A second of it."""
-        return self.made("moment.mcap", lambda path: cli("trim", self.flight, path, "--to-s", 1))
+        """The first second of ``flight``."""
+        return self.make_once(
+            "moment.mcap", lambda path: cli("trim", self.flight, path, "--to-s", 1)
+        )
 
     @property
     def flights(self) -> Path:
         """A folder with two recordings."""
-        return self.made("flights", lambda path: flights(self, path))
+        return self.make_once("flights", lambda path: copy_flights(self, path))
 
     @property
     def indexed(self) -> Path:
-        """The same with a catalogue."""
-        return self.made("indexed", lambda path: (flights(self, path), cli("index", path)))
+        """``flights`` with a catalogue."""
+        return self.make_once(
+            "indexed", lambda path: (copy_flights(self, path), cli("index", path))
+        )
 
     @property
     def seen(self) -> Path:
-        """The same with detections."""
-        return self.made("seen.mcap", lambda path: with_detections(self.flight, path))
+        """``flight`` with detections."""
+        return self.make_once("seen.mcap", lambda path: with_detections(self.flight, path))
 
     @property
     def pair(self) -> Path:
-        """Half a minute of two robots' ranges; the clock of one is ahead."""
-        return self.made("pair.mcap", _pair)
+        """Ranges of two robots for 28 s; one clock is 0.08 s ahead."""
+        return self.make_once("pair.mcap", write_pair)
 
     @property
     def boards(self) -> Path:
-        """Pictures of a chessboard."""
-        return self.made("boards", _boards)
+        """A folder with images of a chessboard."""
+        return self.make_once("boards", draw_boards)
 
     @property
     def camera(self) -> Path:
         """A camera file."""
         flags = "--board", "7x5"
-        return self.made("camera.toml", lambda path: cli("calibrate", self.boards, path, *flags))
+        return self.make_once(
+            "camera.toml", lambda path: cli("calibrate", self.boards, path, *flags)
+        )
 
     @property
     def chain(self) -> Path:
-        """A pipeline."""
-        return self.made("chain.toml", lambda path: path.write_text(CHAIN))
+        """A recipe of a pipeline."""
+        return self.make_once("chain.toml", lambda path: path.write_text(CHAIN))
 
     @property
     def short(self) -> Path:
-        """A training of one epoch."""
-        return self.made("short.toml", lambda path: path.write_text(SHORT))
+        """A recipe of a training of one epoch."""
+        return self.make_once("short.toml", lambda path: path.write_text(SHORT))
 
     @property
     def scene(self) -> Path:
-        """Two renders."""
-        return self.made("scene.toml", lambda path: path.write_text(SCENE))
+        """A recipe of two renders."""
+        return self.make_once("scene.toml", lambda path: path.write_text(SCENE))
 
     @property
     def set(self) -> Path:
         """The dataset of ``dots``."""
-        return self.made("set", lambda path: cli("dataset", self.dots, path))
+        return self.make_once("set", lambda path: cli("dataset", self.dots, path))
 
     @property
     def more(self) -> Path:
-        """Twelve other images."""
-        return self.made("more.mcap", lambda path: _dots(path, seed=1))
+        """A recording of twelve other images."""
+        return self.make_once("more.mcap", lambda path: write_dots(path, seed=1))
 
     @property
     def packed(self) -> Path:
         """A dataset of ``dots`` in Parquet."""
-        return self.made("packed", lambda path: cli("dataset", self.dots, path, "--parquet"))
+        return self.make_once("packed", lambda path: cli("dataset", self.dots, path, "--parquet"))
 
     @property
     def saved(self) -> Path:
-        """``set`` without a manifest, as if `datasets` had saved it."""
-        return self.made("saved", self._saved)
+        """``set`` without a manifest, as the library `datasets` would save it."""
+        return self.make_once("saved", self._saved)
 
     def _saved(self, path: Path) -> None:
         shutil.copytree(self.set, path, ignore=shutil.ignore_patterns("manifest.json", "parts"))
 
     @property
     def model(self) -> Path:
-        """A network of one epoch."""
-        return self.made("model", lambda path: cli("train", self.set, path, *self.training))
+        """A network trained for one epoch."""
+        return self.make_once("model", lambda path: cli("train", self.set, path, *self.training))
 
     @property
     def training(self) -> tuple[object, ...]:
-        """Flags of that training."""
+        """Flags of the training of ``model``."""
         return "--recipe", self.short, "--device", "cpu"
 
     @property
     def found(self) -> Path:
         """``dots`` with its detections."""
-        return self.made("found.mcap", lambda path: cli("predict", self.model, self.dots, path))
+        return self.make_once(
+            "found.mcap", lambda path: cli("predict", self.model, self.dots, path)
+        )
 
     @property
     def int8(self) -> Path:
-        """Its int8 form."""
-        return self.made("int8", lambda path: cli("quantize", self.model, self.set, path))
+        """``model``, quantized to int8."""
+        return self.make_once("int8", lambda path: cli("quantize", self.model, self.set, path))
 
     @property
     def proof(self) -> Path:
-        """What `dmrl verify` found in it."""
-        return self.made("proof", lambda path: tried(self, path))
+        """The pickled result of `dmrl verify` for ``c``."""
+        return self.make_once("proof", lambda path: verify_export(self, path))
 
     @property
     def c(self) -> Path:
-        """Its C."""
-        return self.made("c", lambda path: cli("export", self.int8, path))
+        """``int8``, exported to C."""
+        return self.make_once("c", lambda path: cli("export", self.int8, path))
 
 
 def cli(*words: object) -> None:
-    """A command line.
+    """Run a dmrl command with the substitutes of `STAND_INS`.
 
     Raises
     ------
@@ -214,8 +224,8 @@ def cli(*words: object) -> None:
                 raise
 
 
-def _dots(path: Path, seed: int = 0) -> None:
-    """Twelve images of a bright square on dark noise, in chunks of a few, with labels."""
+def write_dots(path: Path, seed: int = 0) -> None:
+    """Write twelve labelled images of a bright square on dark noise, four to a chunk."""
     rng = np.random.default_rng(seed)
     with RecordingWriter(path, Provenance("test")) as sink:
         sink.add_metadata(
@@ -239,13 +249,15 @@ def _dots(path: Path, seed: int = 0) -> None:
                 sink.flush()
 
 
-def flights(inputs: Inputs, folder: Path) -> None:
+def copy_flights(inputs: Inputs, folder: Path) -> None:
+    """Make a folder with two copies of ``dots``."""
     folder.mkdir()
     for name in "ab":
         shutil.copy(inputs.dots, folder / f"{name}.mcap")
 
 
-def _pair(path: Path) -> None:
+def write_pair(path: Path) -> None:
+    """Write ranges between two robots, metres; the stamps of cf2 are 0.08 s late."""
     rng = np.random.default_rng(0)
     time = np.cumsum(rng.uniform(0.03, 0.05, 700))
     measured = 3 + 0.5 * np.sin(time) + 0.4 * np.sin(1.7 * time) + rng.normal(0, 0.05, len(time))
@@ -256,7 +268,8 @@ def _pair(path: Path) -> None:
             sink.write(round((at_s + 0.08) * 1e9), RANGE("cf2", "cf1"), ranged)
 
 
-def _boards(folder: Path) -> None:
+def draw_boards(folder: Path) -> None:
+    """Draw seven images of a chessboard."""
     boards = import_module("..estimation.boards", __package__)
     rng = np.random.default_rng(0)
     folder.mkdir()
@@ -265,7 +278,8 @@ def _boards(folder: Path) -> None:
         (folder / f"{k}.png").write_bytes(encode_png(np.repeat(grey[..., None], 3, axis=2)))
 
 
-def tried(i: Inputs, out: Path) -> None:
+def verify_export(i: Inputs, out: Path) -> None:
+    """Pickle the result of `dmrl verify` with gcc."""
     verify = import_module("dmrl.stages.verify")
     settings = verify.Settings(images=1, noise=1, targets=("gcc",))
     out.write_bytes(pickle.dumps(verify.run(i.c, settings)))

@@ -1,4 +1,4 @@
-"""Damage: bytes flipped, overwritten, cut, doubled, inserted, or made extreme."""
+"""Damage data: flip, overwrite, remove, repeat or insert bytes, or set extreme values."""
 
 import numpy as np
 from mcap.opcode import Opcode
@@ -8,8 +8,8 @@ from . import parts
 EXTREMES = (b"\0" * 4, b"\xff" * 4, b"\xff\xff\xff\x7f", b"\0\0\0\x80", b"\1\0\0\0", b"\xff" * 8)
 
 
-def mutated(data: bytes, rng: np.random.Generator) -> bytes:
-    """The same with some kind of damage; half of it near the front, where headers are."""
+def mutate(data: bytes, rng: np.random.Generator) -> bytes:
+    """Return the data with random damage; half of it in the first 400 bytes, near headers."""
     out = bytearray(data)
     reach = max(1, len(out) if rng.random() < 0.5 else min(len(out), 400))
     at, size, kind = int(rng.integers(reach)), int(rng.integers(1, 64)), int(rng.integers(7))
@@ -32,37 +32,40 @@ def mutated(data: bytes, rng: np.random.Generator) -> bytes:
     return bytes(out)
 
 
-def mutated_within(data: bytes, rng: np.random.Generator) -> bytes:
-    """A recording with one record changed, also within a chunk; all sums and places made good."""
+def mutate_record(data: bytes, rng: np.random.Generator) -> bytes:
+    """Return a recording with one record damaged, and every checksum and offset corrected.
+
+    The record may lie within a chunk.
+    """
     records, starts = parts.taken_apart(data, len(parts.MAGIC), len(data) - len(parts.MAGIC))
     if not records:
-        return mutated(data, rng)
+        return mutate(data, rng)
     sums, moved = parts.sums_of(records), dict[int, int]()
     placed = list(zip(records, starts, strict=True))
-    chosen = _chosen(records, rng)
+    chosen = _choose_record(records, rng)
     (opcode, body), place = placed[chosen]
     inner = parts.chunk_parts(body) if opcode == Opcode.CHUNK and rng.random() < 0.8 else None
     if inner is not None:
         kind, unpacked = inner
-        changed, moved = _within_chunk(unpacked, rng)
+        changed, moved = _mutate_chunk(unpacked, rng)
         if rng.random() < 0.1:
             kind = ("zstd", "lz4", "")[int(rng.integers(3))]
         placed[chosen] = (opcode, parts.chunk_of(body, kind, changed)), place
     else:
-        placed[chosen : chosen + 1] = _changed(placed[chosen], rng)
+        placed[chosen : chosen + 1] = _change_record(placed[chosen], rng)
     return parts.put_together(placed, moved, sums)
 
 
-def _chosen(records: list[parts.Record], rng: np.random.Generator) -> int:
-    """One of them, every second time one with messages in it."""
+def _choose_record(records: list[parts.Record], rng: np.random.Generator) -> int:
+    """Return the index of a random record; every second time of one with messages."""
     full = [k for k, (opcode, _) in enumerate(records) if opcode in (Opcode.CHUNK, Opcode.MESSAGE)]
     return int(rng.choice(full)) if full and rng.random() < 0.5 else int(rng.integers(len(records)))
 
 
-def _changed(
+def _change_record(
     placed: tuple[parts.Record, int], rng: np.random.Generator
 ) -> list[tuple[parts.Record, int]]:
-    """A record changed, doubled or dropped."""
+    """Return a record damaged, repeated or removed; repeated ones have the old offset -1."""
     (opcode, body), place = placed
     kind = rng.random()
     if kind < 0.08:
@@ -72,18 +75,18 @@ def _changed(
     if kind < 0.2:
         return [((int(rng.integers(0x11)), body), place)]
     if opcode == Opcode.MESSAGE and len(body) > 22 and rng.random() < 0.7:
-        return [((opcode, body[:22] + mutated_message(body[22:], rng)), place)]
-    return [((opcode, mutated(body, rng)), place)]
+        return [((opcode, body[:22] + mutate_message(body[22:], rng)), place)]
+    return [((opcode, mutate(body, rng)), place)]
 
 
-def _within_chunk(data: bytes, rng: np.random.Generator) -> tuple[bytes, dict[int, int]]:
-    """The records of a chunk with one changed; old and new places."""
+def _mutate_chunk(data: bytes, rng: np.random.Generator) -> tuple[bytes, dict[int, int]]:
+    """Damage one record of a chunk; return all records and the new offset of each old one."""
     records, starts = parts.taken_apart(data)
     if not records:
-        return mutated(data, rng), {}
+        return mutate(data, rng), {}
     placed = list(zip(records, starts, strict=True))
     chosen = int(rng.integers(len(placed)))
-    placed[chosen : chosen + 1] = _changed(placed[chosen], rng)
+    placed[chosen : chosen + 1] = _change_record(placed[chosen], rng)
     out, moved = bytearray(), {}
     for record, place in placed:
         moved[place] = len(out)
@@ -92,11 +95,11 @@ def _within_chunk(data: bytes, rng: np.random.Generator) -> tuple[bytes, dict[in
     return bytes(out), moved
 
 
-def mutated_message(data: bytes, rng: np.random.Generator) -> bytes:
-    """A protobuf message with one field changed, doubled, dropped, or of another kind."""
-    fields = _fields(data)
+def mutate_message(data: bytes, rng: np.random.Generator) -> bytes:
+    """Return a protobuf message with one field damaged, repeated, removed or of another type."""
+    fields = _find_fields(data)
     if not fields or rng.random() < 0.3:
-        return mutated(data, rng)
+        return mutate(data, rng)
     start, at, end = fields[int(rng.integers(len(fields)))]
     key, value = data[start:at], data[at:end]
     kind = int(rng.integers(6))
@@ -109,21 +112,21 @@ def mutated_message(data: bytes, rng: np.random.Generator) -> bytes:
     elif kind == 3:
         new = key + EXTREMES[int(rng.integers(len(EXTREMES)))][: max(1, len(value))]
     elif kind == 4 and key[0] & 7 == 2:
-        inner = mutated_message(value[1:], rng) if len(value) > 1 else b"\0"
-        new = key + _varint(len(inner)) + inner
+        inner = mutate_message(value[1:], rng) if len(value) > 1 else b"\0"
+        new = key + _encode_varint(len(inner)) + inner
     else:
-        new = key + _varint(int(rng.integers(1 << 62)) * 2 + 1)
+        new = key + _encode_varint(int(rng.integers(1 << 62)) * 2 + 1)
     return data[:start] + new + data[end:]
 
 
-def _fields(data: bytes) -> list[tuple[int, int, int]]:
-    """Start, value and end of every field, as far as they can be told apart."""
+def _find_fields(data: bytes) -> list[tuple[int, int, int]]:
+    """Return the offsets of start, value and end of every field that can be parsed."""
     found, at = [], 0
     while at < len(data):
         start, kind = at, data[at] & 7
-        at = value = _after_varint(data, at)
+        at = value = _skip_varint(data, at)
         if kind == 0:
-            at = _after_varint(data, at)
+            at = _skip_varint(data, at)
         elif kind == 2 and at < len(data) and data[at] < 128:
             at += 1 + data[at]
         elif kind in (1, 5):
@@ -136,13 +139,13 @@ def _fields(data: bytes) -> list[tuple[int, int, int]]:
     return found
 
 
-def _after_varint(data: bytes, at: int) -> int:
+def _skip_varint(data: bytes, at: int) -> int:
     while at < len(data) and data[at] >= 128:
         at += 1
     return at + 1
 
 
-def _varint(value: int) -> bytes:
+def _encode_varint(value: int) -> bytes:
     out = bytearray()
     while value >= 128:
         out.append(value & 127 | 128)

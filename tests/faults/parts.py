@@ -1,7 +1,7 @@
-"""The parts of an MCAP file, separated and joined again with correct checksums and offsets.
+"""Split an MCAP file into records, and join them again with correct checksums and offsets.
 
-What no checksum and no index refuses has to be met by the code behind them. Written by the
-specification, apart from dmrl and from mcap: both would stop at the first wrong byte.
+Damage then passes every checksum and reaches the code behind them. The module uses neither dmrl
+nor the mcap package, since both would stop at the first wrong byte.
 """
 
 import struct
@@ -17,8 +17,10 @@ Record = tuple[int, bytes]
 CHUNK_HEAD = struct.Struct("<QQQI")
 
 
-def taken_apart(data: bytes, at: int = 0, end: int | None = None) -> tuple[list[Record], list[int]]:
-    """Records, and where each began, up to the first that is not whole."""
+def split_records(
+    data: bytes, at: int = 0, end: int | None = None
+) -> tuple[list[Record], list[int]]:
+    """Return the complete records before ``end``, and the offset of each."""
     end = len(data) if end is None else end
     records, starts = [], []
     while at + 9 <= end:
@@ -31,13 +33,13 @@ def taken_apart(data: bytes, at: int = 0, end: int | None = None) -> tuple[list[
     return records, starts
 
 
-def written(record: Record) -> bytes:
-    """A record as it stands in a file."""
+def pack_record(record: Record) -> bytes:
+    """Return a record as bytes: opcode, length and body."""
     return struct.pack("<BQ", record[0], len(record[1])) + record[1]
 
 
-def chunk_parts(body: bytes) -> tuple[str, bytes] | None:
-    """Compression and unpacked records of a chunk; None where they cannot be had."""
+def unpack_chunk(body: bytes) -> tuple[str, bytes] | None:
+    """Return compression and decompressed records of a chunk, or None if it is damaged."""
     try:
         (length,) = struct.unpack_from("<I", body, CHUNK_HEAD.size)
         at = CHUNK_HEAD.size + 4
@@ -51,8 +53,8 @@ def chunk_parts(body: bytes) -> tuple[str, bytes] | None:
         return None
 
 
-def chunk_of(head: bytes, kind: str, inner: bytes) -> bytes:
-    """A chunk that holds these records, with the times of another."""
+def pack_chunk(head: bytes, kind: str, inner: bytes) -> bytes:
+    """Return a chunk of these records, with the first and last time of the chunk ``head``."""
     first, last = struct.unpack_from("<QQ", head)
     pack = {"zstd": zstandard.compress, "lz4": lz4.frame.compress}.get(kind, bytes)
     data = pack(inner)
@@ -60,19 +62,19 @@ def chunk_of(head: bytes, kind: str, inner: bytes) -> bytes:
     return head + struct.pack("<I", len(kind)) + kind.encode() + struct.pack("<Q", len(data)) + data
 
 
-def put_together(
+def join_records(
     records: Sequence[tuple[Record, int]], moved: dict[int, int], sums: tuple[int, int]
 ) -> bytes:
-    """A file of records, each with its place in the file before; None of its old places is left.
+    """Return a file of these records, with every offset and checksum corrected.
 
     Parameters
     ----------
     records
-        Record, and where it was; -1: nowhere.
+        Each record and its old offset in the file; -1 for a new record.
     moved
-        Old and new places within chunks.
+        New offset of each old one within chunks.
     sums
-        CRC-32 of the metadata and of the message indexes in the file before, as dmrl keeps them.
+        CRC-32 of the metadata and of the message indexes of the old file, as dmrl stores them.
     """
     at, places = len(MAGIC), {}
     for record, old in records:
@@ -82,12 +84,12 @@ def put_together(
     out, start, metadata, indexes = bytearray(MAGIC), 0, 0, 0
     for (opcode, body), _ in records:
         if opcode == Opcode.MESSAGE_INDEX:
-            body = _moved_index(body, moved)
-            indexes = zlib.crc32(written((opcode, body)), indexes)
+            body = _correct_message_index(body, moved)
+            indexes = zlib.crc32(pack_record((opcode, body)), indexes)
         elif opcode == Opcode.METADATA:
             for before, now in zip(sums, (metadata, indexes), strict=True):
                 body = body.replace(f"{before:08x}".encode(), f"{now:08x}".encode())
-            metadata = zlib.crc32(written((opcode, body)), metadata)
+            metadata = zlib.crc32(pack_record((opcode, body)), metadata)
         elif opcode == Opcode.ATTACHMENT and len(body) > 4:
             body = body[:-4] + struct.pack("<I", zlib.crc32(body[:-4]))
         elif opcode == Opcode.FOOTER and len(body) == 20:
@@ -96,21 +98,23 @@ def put_together(
             crc = zlib.crc32(head, zlib.crc32(out[start:])) if body[16:] != bytes(4) else 0
             body = head[9:] + struct.pack("<I", crc)
         else:
-            body = _moved(opcode, body, places)
-        out += written((opcode, body))
+            body = _correct_offsets(opcode, body, places)
+        out += pack_record((opcode, body))
         if opcode == Opcode.DATA_END:
             start = len(out)
     return bytes(out) + MAGIC
 
 
-def sums_of(records: Sequence[Record]) -> tuple[int, int]:
-    """CRC-32 of all metadata but the last, and of the message indexes."""
+def compute_crcs(records: Sequence[Record]) -> tuple[int, int]:
+    """Return the CRC-32 of all metadata but the last, and of the message indexes."""
     metadata = [record for record in records if record[0] == Opcode.METADATA][:-1]
     indexes = [record for record in records if record[0] == Opcode.MESSAGE_INDEX]
-    return zlib.crc32(b"".join(map(written, metadata))), zlib.crc32(b"".join(map(written, indexes)))
+    return zlib.crc32(b"".join(map(pack_record, metadata))), zlib.crc32(
+        b"".join(map(pack_record, indexes))
+    )
 
 
-def _moved_index(body: bytes, moved: dict[int, int]) -> bytes:
+def _correct_message_index(body: bytes, moved: dict[int, int]) -> bytes:
     out = bytearray(body)
     for at in range(6, len(out) - 15, 16):
         (place,) = struct.unpack_from("<Q", out, at + 8)
@@ -118,8 +122,8 @@ def _moved_index(body: bytes, moved: dict[int, int]) -> bytes:
     return bytes(out)
 
 
-def _moved(opcode: int, body: bytes, places: dict[int, tuple[int, int]]) -> bytes:
-    """The record with the places of others, and their lengths, as they are now."""
+def _correct_offsets(opcode: int, body: bytes, places: dict[int, tuple[int, int]]) -> bytes:
+    """Return a record of the summary with the new offsets and lengths of other records."""
     out = bytearray(body)
     first = {Opcode.CHUNK_INDEX: 16, Opcode.METADATA_INDEX: 0, Opcode.ATTACHMENT_INDEX: 0}
     if opcode in first and len(out) >= first[opcode] + 16:

@@ -1,8 +1,8 @@
 """Possible disk contents after a power failure, from the recorded calls of a command.
 
-strace records what a command and its libraries write, sync, name and remove. `Recorded.survivors`
-gives the folder as it may be after a power loss at any moment: what was synced is there; of what
-came after, data and names are there or not, each apart from the other.
+strace records what a command and its libraries write, sync, rename and remove.
+`Recorded.survivors` yields the folder as it may be after a power loss at any moment. What was
+synced is there. Each later write and name may be there or not, independently of the others.
 """
 
 import os
@@ -24,10 +24,10 @@ HANDLE = re.compile(r"^(\d+)<([^>]*)>")
 
 @dataclass
 class Node:
-    """A file with its writes, or a folder with its names; each change has its moment."""
+    """A file with its writes, or a folder with its names; a moment is the number of a call."""
 
     is_folder: bool = False
-    writes: list[tuple[int, int, bytes]] = field(default_factory=list)  # moment, place, data
+    writes: list[tuple[int, int, bytes]] = field(default_factory=list)  # moment, offset, data
     cuts: list[tuple[int, int]] = field(default_factory=list)  # moment, size
     names: list[tuple[int, str, "Node | None"]] = field(default_factory=list)
     synced: list[int] = field(default_factory=list)
@@ -92,7 +92,7 @@ class Recorded:
     def __init__(self, folder: Path) -> None:
         self.folder, self.moment, self.moments = folder, 0, [0]
         self.root = self._read(folder)
-        self._open: dict[int, tuple[Node, int]] = {}  # by descriptor: node, place
+        self._open: dict[int, tuple[Node, int]] = {}  # by descriptor: node, offset
 
     def _read(self, path: Path) -> Node:
         node = Node(path.is_dir(), synced=[0])
@@ -199,7 +199,7 @@ class Recorded:
             node.writes.append((self.moment, at, data[:result]))
             if call != "pwrite64":
                 self._open[number] = node, at + result
-        elif call == "sendfile":  # the file that is copied does not change
+        elif call == "sendfile":  # the source file is not changed meanwhile
             source, start = re.search(r", \d+<([^>]*)>, (?:\[(\d+)\]|NULL)", given).groups()  # type: ignore[union-attr]
             data = Path(unescape(source)).read_bytes()[int(start or place) :][:result]
             node.writes.append((self.moment, place, data))

@@ -1,4 +1,4 @@
-"""The process with everything loaded, which forks for each command. Started by disk.py."""
+"""The process that disk.py starts: it keeps all modules loaded and forks for each command."""
 
 import gc
 import importlib
@@ -16,39 +16,39 @@ from typing import Any
 
 from dmrl.boundary import open_standard_streams
 
-from .disk import small_files
-from .ending import ended
+from .disk import limit_file_size
+from .ending import run_to_end
 from .workloads import READS, WORKLOADS, Inputs, find_workload
 
 HANG_S = 300
-"""A command that takes longer hangs, on a machine however busy."""
+"""A command that takes longer counts as hanging, even on a busy machine."""
 
 
 def main(folder: str) -> None:
-    """Answer jobs, a line each, until there are no more."""
+    """Answer jobs, one per line of standard input, until it ends."""
     answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
-    os.dup2(2, 1)  # what a library prints is no answer
+    os.dup2(2, 1)  # keeps what libraries print out of the answers
     inputs, told_in = Inputs(Path(folder) / "inputs"), Path(folder) / "answer"
     inputs.folder.mkdir()
     for line in sys.stdin:
-        answer = in_a_child(json.loads(line), inputs, told_in)
+        answer = run_in_child(json.loads(line), inputs, told_in)
         _load(answer.pop("modules", []))
         print(json.dumps(answer), file=answers, flush=True)
 
 
-def in_a_child(told: dict[str, Any], inputs: Inputs, told_in: Path) -> dict[str, Any]:
-    """What a function gave, or how it ended; what it loaded, which the next then need not."""
+def run_in_child(told: dict[str, Any], inputs: Inputs, told_in: Path) -> dict[str, Any]:
+    """Run a job in a child; return its result or fault, and the modules that it loaded."""
     begun_s = time.monotonic()
     told_in.unlink(missing_ok=True)
     gc.freeze()  # a collection in the child would copy every page
     number = os.fork()
     if number == 0:
-        _child(told, inputs, told_in)
+        _answer_job(told, inputs, told_in)
     if told["kill_s"] is not None:
         watched = os.pidfd_open(number)
         select.select([watched], [], [], told["kill_s"])
         os.close(watched)
-        os.kill(number, signal.SIGKILL)  # nobody has waited for it: the number is still its own
+        os.kill(number, signal.SIGKILL)  # before wait4 the process ID cannot be reused
     _, ended_as, used = os.wait4(number, 0)
     status = os.waitstatus_to_exitcode(ended_as)
     answer: dict[str, Any] = {"value": None}
@@ -61,7 +61,7 @@ def in_a_child(told: dict[str, Any], inputs: Inputs, told_in: Path) -> dict[str,
     return {**answer, "seconds": time.monotonic() - begun_s, "rss_kb": used.ru_maxrss}
 
 
-def _child(told: dict[str, Any], inputs: Inputs, told_in: Path) -> None:
+def _answer_job(told: dict[str, Any], inputs: Inputs, told_in: Path) -> None:
     answer: dict[str, Any]
     try:
         signal.alarm(HANG_S)
@@ -75,29 +75,29 @@ def _child(told: dict[str, Any], inputs: Inputs, told_in: Path) -> None:
 
 
 def run_work(inputs: Inputs, work: str, out: str, most_bytes: int | None) -> tuple[int, str]:
-    """How a work ended."""
+    """Run a workload; return its exit status and error line."""
     run = find_workload(work).run
-    with small_files(most_bytes):
-        return ended(lambda: run(inputs, Path(out)))
+    with limit_file_size(most_bytes):
+        return run_to_end(lambda: run(inputs, Path(out)))
 
 
-def run_mute(inputs: Inputs, work: str, out: str, stream: str) -> tuple[int, str]:
-    """How a work ended whose standard output is "full" or "closed"."""
+def run_without_stdout(inputs: Inputs, work: str, out: str, stream: str) -> tuple[int, str]:
+    """Run a workload whose standard output is "full" or "closed"; return status and error line."""
     os.close(1)
     if stream == "full":
         os.open("/dev/full", os.O_WRONLY)
     sys.stdout = None  # type: ignore[assignment]
     open_standard_streams()
-    kept = sys.stdout  # a child that forgets it would close 1, where it answers
+    kept = sys.stdout  # garbage collection of it would close descriptor 1
     run = (READS | {one.name: one.run for one in WORKLOADS})[work]
     try:
-        return ended(lambda: run(inputs, Path(out)), mute=True)
+        return run_to_end(lambda: run(inputs, Path(out)), mute=True)
     finally:
         del kept
 
 
 def run_together(inputs: Inputs, work: str, out: str, times: int) -> list[tuple[int, str]]:
-    """How a work ended that is run several times at once, in processes of their own."""
+    """Run a workload in several processes at once; return status and error line of each."""
     ears = []
     for _ in range(times):
         ear, mouth = os.pipe()
@@ -120,14 +120,14 @@ def run_together(inputs: Inputs, work: str, out: str, times: int) -> list[tuple[
 
 
 def prepare_work(inputs: Inputs, work: str, out: str) -> None:
-    """Make what has to be there before it."""
+    """Make what a workload needs before it starts."""
     before = find_workload(work).before
     if before is not None:
         before(inputs, Path(out))
 
 
 def _load(names: list[str]) -> None:
-    """Load what a child had to, so that the next need not; rerun's threads would not be there."""
+    """Load the modules that a child loaded, except rerun: its threads would not survive a fork."""
     for name in names:
         if name not in sys.modules and not name.startswith("rerun"):
             with warnings.catch_warnings(), suppress(Exception):

@@ -1,7 +1,6 @@
-"""Substitutes for work that takes long and writes no output.
+"""Fast substitutes for slow work that writes no output.
 
-Blender, new processes, compilers, most of a search, the drawing of figures: what uses them is as
-it always is.
+They replace Blender, new Python processes, most of a parameter search and the drawing of figures.
 """
 
 import os
@@ -21,14 +20,14 @@ from dmrl.rendering.robots import crazyflie
 from dmrl.rendering.worker_pool import WorkerStart
 
 FEW = (2, 3)
-"""In place of the rounds, and the pictures, that `dmrl likeness` fits a camera by."""
+"""Replaces the numbers of rounds and images with which `dmrl likeness` fits a camera."""
 
 
 class Painter:
-    """In place of a Blender process: a grey spot for every robot that is asked for."""
+    """Replaces a Blender process: draws a grey spot for every robot."""
 
     def request(self, head: dict[str, Any], arrays: Arrays | None = None) -> tuple[Any, Arrays]:
-        """As `dmrl.rendering.worker_pool.Worker.ask`."""
+        """Answer as `dmrl.rendering.worker_pool.Worker.request` does."""
         if "panorama" in head:
             return {}, {"panorama": np.full((8, 16, 3), 0.5, np.float32)}
         left, top, right, bottom = head["crop_px"]
@@ -42,18 +41,18 @@ class Painter:
 
 
 class Painters:
-    """In place of `dmrl.rendering.worker_pool.WorkerPool`."""
+    """Replaces `dmrl.rendering.worker_pool.WorkerPool`."""
 
     def __init__(self, start: WorkerStart, count: int) -> None:
         self.version = "0"
         self.points = np.asarray(crazyflie.CRAZYFLIE.build_mesh().vertices, float)
 
     def call(self, job: Callable[[Painter], Any]) -> Any:
-        """What ``job`` makes of a painter."""
+        """Return the result of ``job`` for a painter."""
         return job(Painter())
 
     def map(self, job: Callable[[Painter, Any], Any], tasks: Iterable[Any]) -> Iterator[Any]:
-        """Results of all tasks."""
+        """Return the results of all tasks."""
         return (job(Painter(), task) for task in tasks)
 
     def __exit__(self, *_: object) -> None:
@@ -61,26 +60,25 @@ class Painters:
 
 
 nothing = None
-"""In place of a module with figures, as where matplotlib is not installed."""
+"""Replaces a module with figures, as if matplotlib were not installed."""
 
 
 def sky(_: Path) -> list[Path]:
-    """In place of `dmrl.rendering.renderer.list_shipped_panoramas`."""
+    """Replace `dmrl.rendering.renderer.list_shipped_panoramas`."""
     return [Path("sky.exr")]
 
 
 def no_python(_: object) -> Path:
-    """In place of `dmrl.rendering.blender_environment.ensure_environment`."""
+    """Replace `dmrl.rendering.blender_environment.ensure_environment`."""
     return Path("python")
 
 
 def blank(*_: object) -> None:
-    """In place of `matplotlib.figure.Figure.draw`: figures are saved empty."""
+    """Replace `matplotlib.figure.Figure.draw`, so that figures are saved empty."""
 
 
 class Forked:
-    """In place of a new Python: a child that has everything loaded, and works as `ProcessPool`'s
-    do."""
+    """Replaces a new Python process of `ProcessPool` by a forked child with all modules loaded."""
 
     def __init__(self, _: list[str], **given: Any) -> None:
         jobs, our_jobs = os.pipe()
@@ -89,7 +87,7 @@ class Forked:
         if self.pid == 0:
             os.close(our_jobs)
             os.close(our_answers)
-            _work(jobs, answers)
+            _run_worker(jobs, answers)
         os.close(jobs)
         os.close(answers)
         self.stdin: TextIO = os.fdopen(our_jobs, "w", encoding="utf-8")
@@ -97,33 +95,33 @@ class Forked:
         self.status: int | None = None
 
     def send_signal(self, number: int) -> None:
-        """Send it a signal."""
+        """Send the child a signal."""
         os.kill(self.pid, number)
 
     def wait(self, timeout_s: float | None = None) -> int:
-        """How it ended; it always ends soon."""
+        """Wait for the child, without a timeout as it ends soon; return its exit status."""
         if self.status is None:
             self.status = os.waitstatus_to_exitcode(os.waitpid(self.pid, 0)[1])
         return self.status
 
 
 class Processes:
-    """In place of the module ``subprocess``."""
+    """Replaces the module ``subprocess``."""
 
     PIPE = subprocess.PIPE
     TimeoutExpired = subprocess.TimeoutExpired
     Popen = Forked
 
 
-def _work(jobs: int, answers: int) -> NoReturn:
-    """The life of a step's process."""
+def _run_worker(jobs: int, answers: int) -> NoReturn:
+    """Run the worker process of a pipeline step until its parent ends."""
     try:
         os.setsid()
         signal.signal(signal.SIGALRM, signal.SIG_DFL)
         signal.alarm(120)  # an alarm is not inherited
         os.dup2(jobs, 0)
         os.dup2(answers, 1)
-        # The other ends of its parent's pipes, too: they tell of its parent's death.
+        # Close the parent's ends of the pipes too, or the worker would not notice its death.
         os.closerange(3, 4096)
         sys.stdin = os.fdopen(0, "r", encoding="utf-8")
         sys.stdout = sys.stderr = os.fdopen(2, "w", encoding="utf-8")

@@ -1,32 +1,36 @@
-"""Damaged or hostile third-party files: one line or a result, and nothing outside OUT."""
+"""Damaged third-party files give a result or a one-line error, and change no other file."""
 
 from pathlib import Path
 
 import pytest
 
-from .conftest import Count, cases_of
+from .conftest import Count, scale_cases
 from .damaged_files import SOURCES
 from .disk import Disk
 
-AT_ONCE = 25
-"""Cases that a process goes through before a fresh one."""
+CASES_PER_PROCESS = 25
+"""Cases that one process tries before a new one starts."""
 MEMORY_KB = 1_500_000
-"""What a process may take, torch and all."""
+"""Memory limit of a process, including torch."""
 QUICK = ("labels of pictures", "a recipe of a pipeline")
 
 
-def damaged(name: str, disk: Disk, folder: Path, cases: int, count: Count) -> None:
-    """Damage one file of a source again and again, and use it."""
+def check_damaged_source(name: str, disk: Disk, folder: Path, cases: int, count: Count) -> None:
+    """Damage and use a source in this many cases; assert that no other file changes."""
     victim = folder / "victim"
     victim.write_text("precious")
     (folder / "out").mkdir()
-    assert disk.call("damaged_files:begin", name=name, folder=str(folder)) == 0
+    assert disk.call("damaged_files:use_sound_source", name=name, folder=str(folder)) == 0
     before = {path for path in folder.rglob("*") if "out" not in path.parts}
     refused = 0
-    for seed in range(-(-cases // AT_ONCE)):
-        some = min(AT_ONCE, cases - seed * AT_ONCE)
+    for seed in range(-(-cases // CASES_PER_PROCESS)):
+        some = min(CASES_PER_PROCESS, cases - seed * CASES_PER_PROCESS)
         refused += disk.call(
-            "damaged_files:damage", name=name, folder=str(folder), seed=seed, cases=some
+            "damaged_files:use_damaged_sources",
+            name=name,
+            folder=str(folder),
+            seed=seed,
+            cases=some,
         )
         assert disk.rss_kb < MEMORY_KB, f"seed {seed}: {disk.rss_kb / 1e6:.1f} GB"
     assert victim.read_text() == "precious"
@@ -39,7 +43,7 @@ def damaged(name: str, disk: Disk, folder: Path, cases: int, count: Count) -> No
 def test_damaged_files_are_refused_or_read(
     name: str, disk: Disk, tmp_path: Path, count: Count
 ) -> None:
-    damaged(name, disk, tmp_path, 10, count)
+    check_damaged_source(name, disk, tmp_path, 10, count)
 
 
 @pytest.mark.slow
@@ -48,4 +52,4 @@ def test_damaged_files_are_refused_or_read(
 def test_damaged_files_of_every_kind_are_refused_or_used(
     name: str, disk: Disk, tmp_path: Path, count: Count
 ) -> None:
-    damaged(name, disk, tmp_path, cases_of(1000), count)
+    check_damaged_source(name, disk, tmp_path, scale_cases(1000), count)

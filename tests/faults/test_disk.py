@@ -1,4 +1,4 @@
-"""A disk that fails at the n-th operation, for every n and every command that writes."""
+"""Let the n-th disk operation fail, for every n and every command that writes."""
 
 import errno
 from pathlib import Path
@@ -8,7 +8,7 @@ import pytest
 
 from dmrl.cli import COMMANDS
 
-from .conftest import SHARE, Count, cases_of
+from .conftest import SHARE, Count, scale_cases
 from .disk import KILL, Disk, Fault
 from .fault_trials import FaultTrials
 from .workloads import RECORD, WORKLOADS, Workload, find_workload
@@ -17,32 +17,32 @@ SLOW = [pytest.param(work, id=work.name, marks=pytest.mark.slow) for work in WOR
 QUICK = [pytest.param(work, id=work.name) for work in WORKLOADS if work.name == "trim"]
 KILLS = 50
 SIZES = 8
-AT_ONCE = 12
-"""Operations that a process goes through, with every error, before a fresh one."""
+OPERATIONS_PER_PROCESS = 12
+"""Operations that one process breaks, with every error, before a new one starts."""
 WRITES_NOTHING = {"check", "doctor", "fake-drone", "find", "info"}
 IS_A_RUN = {"demo"}
-"""It is `dmrl run demo`."""
+"""Commands that run a pipeline: `dmrl demo` is `dmrl run demo`."""
 
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """The disk; inputs are elsewhere."""
+    """Return the folder of the disk that fails; the inputs lie elsewhere."""
     return tmp_path / "disk"
 
 
 def test_every_command_that_writes_is_broken() -> None:
-    broken = {work.of for work in (*WORKLOADS, RECORD)}
-    assert broken == set(COMMANDS) - WRITES_NOTHING - IS_A_RUN
+    covered = {work.of for work in (*WORKLOADS, RECORD)}
+    assert covered == set(COMMANDS) - WRITES_NOTHING - IS_A_RUN
 
 
 @pytest.mark.slow
 def test_writes_of_c_libraries_reach_the_faulty_disk(disk: Disk, folder: Path) -> None:
     """Arrow opens and writes the tables of a dataset without Python."""
-    broken = FaultTrials(find_workload("dataset"), disk, folder, disk.inputs)
+    trials = FaultTrials(find_workload("dataset"), disk, folder, disk.inputs)
     failed = []
-    for at in range(broken.sound.operations):
-        broken.clear()
-        failed.append(broken.run(Fault(at, errno.EIO)).failed)
+    for at in range(trials.sound.operations):
+        trials.clear()
+        failed.append(trials.run(Fault(at, errno.EIO)).failed)
         if ".arrow" in failed[-1] and failed[-1].startswith("write"):
             return
     raise AssertionError(failed)
@@ -51,27 +51,27 @@ def test_writes_of_c_libraries_reach_the_faulty_disk(disk: Disk, folder: Path) -
 @pytest.mark.heavy
 @pytest.mark.parametrize("work", [pytest.param(work, id=work.name) for work in WORKLOADS])
 def test_every_command_succeeds_without_faults(work: Workload, disk: Disk, folder: Path) -> None:
-    """What the slow ones begin with: a work that its command has outgrown is seen early."""
+    """The slow tests need this; it shows early that a workload no longer fits its command."""
     assert FaultTrials(work, disk, folder, disk.inputs).whole
 
 
-def broken_everywhere(broken: FaultTrials, disk: Disk, count: Count, *, quick: bool) -> None:
-    """Every operation fails once with each error; ``quick``: with the next of them in turn.
+def break_every_operation(trials: FaultTrials, disk: Disk, count: Count, *, quick: bool) -> None:
+    """Let every operation fail with each error; ``quick``: with one of them, in turn.
 
-    One process goes through many of them, as a program that uses dmrl would.
+    One process tries many of them, as a program that uses dmrl might.
     """
-    assert broken.sound.operations > 2
-    for first in range(0, broken.sound.operations, AT_ONCE):
-        last = min(first + AT_ONCE, broken.sound.operations)
-        given = {"work": broken.work.name, "folder": str(broken.folder), "quick": quick}
-        broken.add(**disk.call("in_process:break_at", first=first, last=last, **given))
-    broken.report("the n-th operation fails", count)
+    assert trials.sound.operations > 2
+    for first in range(0, trials.sound.operations, OPERATIONS_PER_PROCESS):
+        last = min(first + OPERATIONS_PER_PROCESS, trials.sound.operations)
+        given = {"work": trials.work.name, "folder": str(trials.folder), "quick": quick}
+        trials.add(**disk.call("in_process:break_at", first=first, last=last, **given))
+    trials.report("the n-th operation fails", count)
 
 
 @pytest.mark.parametrize("work", QUICK)
 @pytest.mark.heavy
 def test_every_operation_may_fail(work: Workload, disk: Disk, folder: Path, count: Count) -> None:
-    broken_everywhere(FaultTrials(work, disk, folder, disk.inputs), disk, count, quick=True)
+    break_every_operation(FaultTrials(work, disk, folder, disk.inputs), disk, count, quick=True)
 
 
 @pytest.mark.timeout(3000)
@@ -79,7 +79,9 @@ def test_every_operation_may_fail(work: Workload, disk: Disk, folder: Path, coun
 def test_every_operation_may_fail_in_every_way(
     work: Workload, disk: Disk, folder: Path, count: Count
 ) -> None:
-    broken_everywhere(FaultTrials(work, disk, folder, disk.inputs), disk, count, quick=SHARE < 1)
+    break_every_operation(
+        FaultTrials(work, disk, folder, disk.inputs), disk, count, quick=SHARE < 1
+    )
 
 
 @pytest.mark.timeout(3000)
@@ -87,29 +89,29 @@ def test_every_operation_may_fail_in_every_way(
 def test_file_size_limit_of_the_kernel_is_reported(
     work: Workload, disk: Disk, folder: Path, count: Count
 ) -> None:
-    broken = FaultTrials(work, disk, folder, disk.inputs)
-    largest = max(map(len, broken.whole.values()))
+    trials = FaultTrials(work, disk, folder, disk.inputs)
+    largest = max(map(len, trials.whole.values()))
     for size in np.unique(np.geomspace(1, largest, SIZES).astype(int) - 1).tolist():
-        broken.clear()
-        ending = broken.run(most_bytes=size)
-        broken.judge(ending, f"no file over {size} bytes", may_stay=False, again=True)
-    assert broken.refused
-    broken.report("no file may be larger (RLIMIT_FSIZE)", count)
+        trials.clear()
+        ending = trials.run(most_bytes=size)
+        trials.judge(ending, f"no file over {size} bytes", may_stay=False, again=True)
+    assert trials.refused
+    trials.report("no file may be larger (RLIMIT_FSIZE)", count)
 
 
-def killed(broken: FaultTrials, count: Count, moments: int) -> None:
-    """Kill it at a random operation, and at a random moment, in turn."""
-    rng = np.random.default_rng(len(broken.work.name))
+def kill_at_random(trials: FaultTrials, count: Count, moments: int) -> None:
+    """Kill the command at a random operation and at a random time, in turn."""
+    rng = np.random.default_rng(len(trials.work.name))
     for k in range(moments):
-        broken.clear()
+        trials.clear()
         if k % 2:
-            fault = Fault(int(rng.integers(broken.sound.operations)), KILL)
-            ending, why = broken.run(fault), str(fault)
+            fault = Fault(int(rng.integers(trials.sound.operations)), KILL)
+            ending, why = trials.run(fault), str(fault)
         else:
-            kill_s = float(rng.random()) * broken.sound.seconds
-            ending, why = broken.run(kill_s=kill_s), f"killed after {kill_s:.3f} s"
-        broken.judge(ending, why, may_stay=True, again=True)
-    broken.report("kill -9", count)
+            kill_s = float(rng.random()) * trials.sound.seconds
+            ending, why = trials.run(kill_s=kill_s), f"killed after {kill_s:.3f} s"
+        trials.judge(ending, why, may_stay=True, again=True)
+    trials.report("kill -9", count)
 
 
 @pytest.mark.heavy
@@ -117,7 +119,7 @@ def killed(broken: FaultTrials, count: Count, moments: int) -> None:
 def test_killed_command_leaves_no_partial_output(
     work: Workload, disk: Disk, folder: Path, count: Count
 ) -> None:
-    killed(FaultTrials(work, disk, folder, disk.inputs), count, 6)
+    kill_at_random(FaultTrials(work, disk, folder, disk.inputs), count, 6)
 
 
 @pytest.mark.timeout(3000)
@@ -125,4 +127,4 @@ def test_killed_command_leaves_no_partial_output(
 def test_command_killed_at_any_operation_leaves_no_partial_output(
     work: Workload, disk: Disk, folder: Path, count: Count
 ) -> None:
-    killed(FaultTrials(work, disk, folder, disk.inputs), count, cases_of(KILLS))
+    kill_at_random(FaultTrials(work, disk, folder, disk.inputs), count, scale_cases(KILLS))

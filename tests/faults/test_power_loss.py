@@ -1,7 +1,7 @@
-"""Power failures at any moment: outputs are complete, and extended ones old or new.
+"""After a power failure at any moment, outputs are complete or absent, extended ones old or new.
 
-What counts as written is what was synced by then; see `power_loss`. The calls are those of the
-command and of its libraries, as the system sees them.
+Only data that were synced count as written; see `power_loss`. strace records the system calls of
+the command and of its libraries.
 """
 
 import shutil
@@ -15,7 +15,7 @@ from dmrl.datasets import open_dataset
 
 from .inputs import Inputs, cli, flights
 from .power_loss import Recorded
-from .workloads import contents
+from .workloads import read_contents
 
 pytestmark = [
     pytest.mark.slow,
@@ -38,8 +38,8 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Inputs:
     return Inputs(tmp_path_factory.mktemp("inputs"))
 
 
-def record(words: str, inputs: Inputs, disk: Path, log: Path) -> Recorded:
-    """Run a command below a folder, and return what it wrote in which order."""
+def record_command(words: str, inputs: Inputs, disk: Path, log: Path) -> Recorded:
+    """Run a command that writes below a folder, and return its recorded calls."""
     known = ("dots", "moment", "int8", "model", "set", "short", "more", "chain")
     places = {name: getattr(inputs, name) for name in known if f"{{{name}}}" in words}
     filled = [word.format(out=disk, **places) for word in words.split()]
@@ -51,7 +51,10 @@ def record(words: str, inputs: Inputs, disk: Path, log: Path) -> Recorded:
 def check_survivors(
     recorded: Recorded, into: Path, states: list[object], read: Callable[[Path], object]
 ) -> int:
-    """Hold that every survivor is in one of the states, the last of them at the end."""
+    """Assert that every survivor is in one of the states, and the last ones in the last state.
+
+    Return the number of survivors.
+    """
     into.mkdir()
     count = 0
     for moment, place in recorded.survivors(into):
@@ -63,8 +66,8 @@ def check_survivors(
 
 
 def read_output(path: Path) -> object:
-    """Return what is in an output; None where there is none."""
-    return contents(path) if path.exists() else None
+    """Return the content of an output, or None if it does not exist."""
+    return read_contents(path) if path.exists() else None
 
 
 @pytest.mark.parametrize("work", OUTPUTS)
@@ -76,7 +79,7 @@ def test_output_is_complete_or_absent_after_power_loss(
     disk.mkdir()
     if work == "index":
         flights(inputs, disk / "a")
-    recorded = record(words, inputs, disk, tmp_path / "log")
+    recorded = record_command(words, inputs, disk, tmp_path / "log")
     whole = read_output(disk / name)
     assert whole
     count = check_survivors(
@@ -96,24 +99,24 @@ def test_append_is_atomic_at_power_loss(packed: bool, inputs: Inputs, tmp_path: 
         return {name: opened.split(name).table["log_time"].to_pylist() for name in opened.splits}
 
     before = read_rows(disk)
-    recorded = record("dataset {more} {out}/a --add", inputs, disk, tmp_path / "log")
+    recorded = record_command("dataset {more} {out}/a --add", inputs, disk, tmp_path / "log")
     after = read_rows(disk)
     assert before != after
     check_survivors(recorded, tmp_path / "survivors", [before, after], read_rows)
 
 
 def test_a_pipeline_goes_on_after_a_power_loss(inputs: Inputs, tmp_path: Path) -> None:
-    """Its memory of what was made may be lost, and is never wrong."""
+    """The pipeline's record of finished steps may be lost but is never wrong."""
     disk = tmp_path / "disk"
     disk.mkdir()
-    recorded = record("run {chain} --out {out}/a", inputs, disk, tmp_path / "log")
-    whole = contents(disk / "a")
+    recorded = record_command("run {chain} --out {out}/a", inputs, disk, tmp_path / "log")
+    whole = read_contents(disk / "a")
     (tmp_path / "survivors").mkdir()
     survivors = list(recorded.survivors(tmp_path / "survivors"))
     for moment, place in survivors[:: max(1, len(survivors) // 6)]:
         for name in ("pictures", "pictures.mcap", "short.mcap"):
             if (place / "a" / name).exists():
-                assert contents(place / "a" / name) == contents(disk / "a" / name), moment
+                assert read_contents(place / "a" / name) == read_contents(disk / "a" / name), moment
         cli("run", inputs.chain, "--out", place / "a")
-        made = contents(place / "a")  # what was made otherwise is kept in previous/
+        made = read_contents(place / "a")  # outputs of other settings are kept in previous/
         assert {k: v for k, v in made.items() if not k.startswith("previous/")} == whole, moment

@@ -1,4 +1,4 @@
-"""Mutated recordings: read, or refused in one line, quickly and in little memory."""
+"""Mutated recordings are read, or refused in one line, quickly and in little memory."""
 
 import io
 import os
@@ -33,16 +33,16 @@ from dmrl.recording import (
     sample_topics,
 )
 
-from .conftest import SEED, Count, cases_of
-from .mutate import mutated, mutated_within
+from .conftest import SEED, Count, scale_cases
+from .mutate import mutate, mutate_record
 
 HANG_S = 20
 MEMORY_BYTES = 500_000_000
-TRACED = 3
-"""Every so many cases are watched: it takes three times as long."""
+TRACED_EVERY = 3
+"""Line coverage is traced in every third case only, as it takes three times as long."""
 TOPICS = ("/cf1/height", "/cf1/labels")
 Result = TypeVar("Result")
-ROOM = str(Path(dmrl.recording.__file__).parent)
+RECORDING_FOLDER = str(Path(dmrl.recording.__file__).parent)
 FOREIGN: tuple[dict[str, Any], ...] = (
     {"compression": CompressionType.NONE, "enable_crcs": False},
     {"compression": CompressionType.NONE, "enable_crcs": False, "use_statistics": False},
@@ -53,7 +53,8 @@ FOREIGN: tuple[dict[str, Any], ...] = (
 )
 
 
-def fill(write: Callable[[int, str, Any], None]) -> None:
+def write_messages(write: Callable[[int, str, Any], None]) -> None:
+    """Write six heights and six labels."""
     for k in range(6):
         write(10 * k, TOPICS[0], message_class("Height")(height_m=k))
         peer = {"peer": "cf2", "u_px": 5.0 * k, "v_px": 7.0, "depth_m": 1.0, "source": "truth"}
@@ -64,9 +65,10 @@ def fill(write: Callable[[int, str, Any], None]) -> None:
         )
 
 
-def ours(path: Path) -> bytes:
+def write_own_recording(path: Path) -> bytes:
+    """Write a recording with dmrl and return its bytes."""
     with RecordingWriter(path, Provenance("test")) as sink:
-        fill(sink.write)
+        write_messages(sink.write)
         sink.flush()
         sink.write(70, TOPICS[0], message_class("Height")(height_m=7))
         sink.add_metadata("dmrl.split", {"train": "[[0, 10]]"})
@@ -74,7 +76,8 @@ def ours(path: Path) -> bytes:
     return path.read_bytes()
 
 
-def foreign(path: Path, options: dict[str, Any]) -> bytes:
+def write_foreign_recording(path: Path, options: dict[str, Any]) -> bytes:
+    """Write a recording with the mcap package and return its bytes."""
     with path.open("wb") as stream:
         writer = Writer(stream, chunk_size=200, **options)
         writer.start()
@@ -82,14 +85,16 @@ def foreign(path: Path, options: dict[str, Any]) -> bytes:
         for topic, kind in zip(TOPICS, ("Height", "PeerLabels"), strict=True):
             schema = writer.register_schema(f"dmrl.v1.{kind}", "protobuf", serialize_schema(kind))
             numbers[topic] = writer.register_channel(topic, "protobuf", schema)
-        fill(lambda t, topic, m: writer.add_message(numbers[topic], t, m.SerializeToString(), t))
+        write_messages(
+            lambda t, topic, m: writer.add_message(numbers[topic], t, m.SerializeToString(), t)
+        )
         writer.add_metadata("dmrl.split", {"train": "[[0, 10]]"})
         writer.finish()
     return path.read_bytes()
 
 
 def read_all(path: Path) -> None:
-    """Every way to read."""
+    """Read a recording with every function that reads one."""
     read_summary(path)
     for _ in read(path):
         pass
@@ -101,15 +106,15 @@ def read_all(path: Path) -> None:
     check(path)
 
 
-class Reach:
-    """Steps from line to line of the recording room that readings came by."""
+class LineCoverage:
+    """Records which steps from line to line within dmrl.recording the readers have taken."""
 
     def __init__(self) -> None:
         self.steps: set[tuple[CodeType, int, int]] = set()
 
     def _call(self, frame: FrameType, _event: str, _: object) -> Any:
         code, steps, before = frame.f_code, self.steps, 0
-        if not _is_ours(code):
+        if not _is_in_recording(code):
             return None
 
         def line(frame: FrameType, event: str, _: object) -> Any:
@@ -121,8 +126,8 @@ class Reach:
 
         return line
 
-    def of(self, work: Callable[[], Result]) -> Result:
-        """What the work gives."""
+    def trace(self, work: Callable[[], Result]) -> Result:
+        """Run the work with tracing and return its result."""
         before = sys.gettrace()
         sys.settrace(self._call)
         try:
@@ -132,31 +137,34 @@ class Reach:
 
 
 @cache
-def _is_ours(code: CodeType) -> bool:
-    return code.co_filename.startswith(ROOM)
+def _is_in_recording(code: CodeType) -> bool:
+    return code.co_filename.startswith(RECORDING_FOLDER)
 
 
-Held = Counter[tuple[str, int, int, bytes]]
+Messages = Counter[tuple[str, int, int, bytes]]
 
 
-def held(path: Path) -> Held:
-    """Its messages, as dmrl reads them."""
+def read_messages_by_dmrl(path: Path) -> Messages:
+    """Return the messages of a recording, as dmrl reads them."""
     return Counter((m.topic, m.time_ns, m.publish_ns, m.data) for m in read_raw(path))
 
 
-def held_by_mcap(data: bytes) -> Held | None:
-    """The same as mcap's own reader reads them; None, where it does not."""
+def read_messages_by_mcap(data: bytes) -> Messages | None:
+    """Return the messages as mcap's own reader reads them, or None if it fails."""
     try:
         return Counter(
             (channel.topic, message.log_time, message.publish_time, message.data)
             for _, channel, message in NonSeekingReader(io.BytesIO(data)).iter_messages()
         )
-    except Exception:  # it leaks many kinds
+    except Exception:  # the mcap package raises many kinds on damaged files
         return None
 
 
-def survived(path: Path) -> bool:
-    """Whether it is read. Else it is refused, in one line; `recover` always ends as well."""
+def check_reading(path: Path) -> bool:
+    """Return whether a recording can be read; assert that errors have one line.
+
+    Recover it too, with the same requirement.
+    """
     out = path.with_name("mended.mcap")
     signal.alarm(HANG_S)  # ends this process
     try:
@@ -176,22 +184,25 @@ def survived(path: Path) -> bool:
     return good
 
 
-def hunt(folder: Path, cases: int, seed: int, count: Count) -> None:
-    """Mutate, and mutate again what came by new steps."""
+def fuzz_readers(folder: Path, cases: int, seed: int, count: Count) -> None:
+    """Read mutated recordings; mutate those again that reach new code."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(os, "fsync", lambda _: None)  # nobody pulls the plug here
-        _hunt(folder, cases, seed, count)
+        patch.setattr(os, "fsync", lambda _: None)  # slow, and needed only for power loss
+        _fuzz_readers(folder, cases, seed, count)
 
 
-def _hunt(folder: Path, cases: int, seed: int, count: Count) -> None:
+def _fuzz_readers(folder: Path, cases: int, seed: int, count: Count) -> None:
     path = folder / "a.mcap"
-    corpus = [ours(path), *(foreign(path, options) for options in FOREIGN)]
+    corpus = [
+        write_own_recording(path),
+        *(write_foreign_recording(path, options) for options in FOREIGN),
+    ]
     path.write_bytes(corpus[0])
-    sound = held(path)
-    rng, reach = np.random.default_rng(seed), Reach()
+    sound = read_messages_by_dmrl(path)
+    rng, reach = np.random.default_rng(seed), LineCoverage()
     for data in corpus:
         path.write_bytes(data)
-        reach.of(lambda: read_all(path))
+        reach.trace(lambda: read_all(path))
     first, begun = len(reach.steps), len(corpus)
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     refused = compared = 0
@@ -201,12 +212,18 @@ def _hunt(folder: Path, cases: int, seed: int, count: Count) -> None:
         within = rng.random(1 + int(rng.geometric(0.7)) // 2) < 0.8
         data = corpus[chosen]
         for one in within:
-            data = (mutated_within if one else mutated)(data, rng)
+            data = (mutate_record if one else mutate)(data, rng)
         path.write_bytes(data)
         known = len(reach.steps)
         try:
-            good = survived(path) if k % TRACED else reach.of(lambda: survived(path))
-            compared += good and nothing_is_lost(path, sound if not chosen + within.any() else None)
+            good = (
+                check_reading(path)
+                if k % TRACED_EVERY
+                else reach.trace(lambda: check_reading(path))
+            )
+            compared += good and compare_with_mcap(
+                path, sound if not chosen + within.any() else None
+            )
         except Exception as e:
             kept = folder / f"found-{k}.mcap"
             kept.write_bytes(data)
@@ -224,30 +241,30 @@ def _hunt(folder: Path, cases: int, seed: int, count: Count) -> None:
     count("mutated recordings", cases=cases, refused=refused, right=cases - refused)
 
 
-def nothing_is_lost(path: Path, sound: Held | None) -> bool:
-    """Whether there was another reader to compare with: it found no message that we did not.
+def compare_with_mcap(path: Path, sound: Messages | None) -> bool:
+    """Assert that mcap's own reader finds no further message; return whether it can read the file.
 
     Parameters
     ----------
     path
         A recording that was read without an error.
     sound
-        What it held before it was damaged, where every byte of that has a checksum.
+        The messages before the damage if every byte has a checksum, else None.
     """
-    found, theirs = held(path), held_by_mcap(path.read_bytes())
+    found, theirs = read_messages_by_dmrl(path), read_messages_by_mcap(path.read_bytes())
     if sound is not None:
-        assert found == sound, "damage that every sum should show"
+        assert found == sound, "damage passed the checksums"
     if theirs is not None:
-        assert not theirs - found, f"lost without a word: {list(theirs - found)[:3]}"
+        assert not theirs - found, f"lost without an error: {list(theirs - found)[:3]}"
     return theirs is not None
 
 
 @pytest.mark.heavy
 def test_mutated_recordings_are_read_or_refused(tmp_path: Path, count: Count) -> None:
-    hunt(tmp_path, 60, 1, count)
+    fuzz_readers(tmp_path, 60, 1, count)
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(3000)
 def test_ten_thousand_mutated_recordings_are_read_or_refused(tmp_path: Path, count: Count) -> None:
-    hunt(tmp_path, cases_of(10_000), SEED, count)
+    fuzz_readers(tmp_path, scale_cases(10_000), SEED, count)

@@ -1,6 +1,6 @@
-"""Large third-party files, or files that claim to be: one line, and bounded memory.
+"""Files that are large, or claim to be, give a one-line error in bounded memory and time.
 
-Each is converted in a process of its own, by the name of its format, as nothing would guess it.
+Each is converted in a process of its own. Its format is given, since it could not be guessed.
 """
 
 import os
@@ -15,20 +15,20 @@ from dmrl.formats.registry import load_builtin_formats
 
 from ..formats.test_fuzz import SOURCES
 from .conftest import Count
-from .ending import ended
+from .ending import run_to_end
 from .workloads import cli
 
 GB = 1 << 30
 HANG_S = 1200
-"""On a machine however busy."""
+"""A conversion that takes longer counts as hanging, even on a busy machine."""
 MEMORY_BYTES, CPU_S = 1_000_000_000, 30.0
-"""More than a file's size explains; a gigabyte explains as much again, and the time to read it."""
+"""Limits for a small file. A large one may take twice its size more, and 30 s more per GB."""
 TEXTS = {
     "csv": ("cf1.csv", b"time_s,x_m,y_m,z_m\n0,1,2,3\n1,1,2,3\n"),
     "cfclient": ("a.csv", b"Timestamp,stateEstimate.x\n0,1\n1,2\n"),
     "locanet": ("posLabel.txt", b"a.png 1 2 3\n"),
 }
-"""Of formats of text: a file, and how it begins."""
+"""Text formats: the name of a file, and its first lines."""
 Make = Callable[[Path], tuple[Path, Path]]
 
 
@@ -45,8 +45,8 @@ OTHERS = load_builtin_formats().keys() - {name for name, _ in SOURCES.values()}
 ALL = {**SOURCES, **{name: (name, _text(name)) for name in sorted(OTHERS)}}
 
 
-def odd(file: Path) -> Iterator[str]:
-    """The file in one odd form after the other."""
+def iter_odd_files(file: Path) -> Iterator[str]:
+    """Write a file in several damaged forms; yield the name of each."""
     whole = file.read_bytes()
     for what, data, size in (
         ("garbage", bytes(range(256)) * 12_000, None),
@@ -66,13 +66,13 @@ def odd(file: Path) -> Iterator[str]:
         yield what
 
 
-def converted(source: Path, name: str, out: Path) -> tuple[int, int, float]:
-    """Status of `dmrl convert` in a child; what it took: bytes, and seconds of CPU."""
+def convert_in_child(source: Path, name: str, out: Path) -> tuple[int, int, float]:
+    """Run `dmrl convert` in a child; return its status, peak memory in bytes and CPU time in s."""
     child = os.fork()
     if child == 0:
         try:
             signal.alarm(HANG_S)
-            os._exit(ended(lambda: cli("convert", source, out, "--from", name))[0])
+            os._exit(run_to_end(lambda: cli("convert", source, out, "--from", name))[0])
         except BaseException:
             os._exit(70)
     _, status, used = os.wait4(child, 0)
@@ -86,9 +86,9 @@ def converted(source: Path, name: str, out: Path) -> tuple[int, int, float]:
 def test_memory_and_cpu_are_bounded_by_file_size(which: str, tmp_path: Path, count: Count) -> None:
     name, make = ALL[which]
     source, file = make(tmp_path)
-    for what in odd(file):
+    for what in iter_odd_files(file):
         size = file.stat().st_size
-        status, took, cpu_s = converted(source, name, tmp_path / "out.mcap")
+        status, took, cpu_s = convert_in_child(source, name, tmp_path / "out.mcap")
         assert status in (0, 1), f"{what}: status {status}"
         assert took < MEMORY_BYTES + 2 * size, f"{what}: {took / 1e6:.0f} MB"
         assert cpu_s < CPU_S * (1 + size / GB), f"{what}: {cpu_s:.0f} s"

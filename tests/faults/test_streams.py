@@ -1,4 +1,4 @@
-"""Closed or full standard output: one line, and finished work stays."""
+"""A closed or full standard output gives a one-line error, and finished output stays."""
 
 from pathlib import Path
 
@@ -7,18 +7,18 @@ import pytest
 from .conftest import Count
 from .disk import Disk
 from .fault_trials import FaultTrials
-from .workloads import READS, WORKLOADS, Workload, clear
+from .workloads import READS, WORKLOADS, Workload, clear_folder
 
 STREAMS = ("full", "closed")
 QUICK = ("info", "find as JSON")
 
 
-def read_mute(name: str, disk: Disk, folder: Path, count: Count) -> None:
-    """What only says something says in one line that it cannot."""
-    clear(folder)
+def check_without_stdout(name: str, disk: Disk, folder: Path, count: Count) -> None:
+    """Assert that a command that only prints reports in one line that it cannot."""
+    clear_folder(folder)
     for stream in STREAMS:
         given = {"work": name, "out": str(folder / "none"), "stream": stream}
-        status, said = disk.call("server:run_mute", **given)
+        status, said = disk.call("server:run_without_stdout", **given)
         assert status == 1, (stream, said)
         assert "standard output" in said, said
         assert not list(folder.iterdir())
@@ -30,7 +30,7 @@ def read_mute(name: str, disk: Disk, folder: Path, count: Count) -> None:
 def test_full_or_closed_stdout_gives_one_line_error(
     name: str, disk: Disk, tmp_path: Path, count: Count
 ) -> None:
-    read_mute(name, disk, tmp_path / "disk", count)
+    check_without_stdout(name, disk, tmp_path / "disk", count)
 
 
 @pytest.mark.slow
@@ -38,7 +38,7 @@ def test_full_or_closed_stdout_gives_one_line_error(
 def test_full_or_closed_stdout_of_each_reading_command_gives_one_line_error(
     name: str, disk: Disk, tmp_path: Path, count: Count
 ) -> None:
-    read_mute(name, disk, tmp_path / "disk", count)
+    check_without_stdout(name, disk, tmp_path / "disk", count)
 
 
 @pytest.mark.slow
@@ -47,11 +47,11 @@ def test_full_or_closed_stdout_of_each_reading_command_gives_one_line_error(
 def test_command_with_unwritable_stdout_completes_or_leaves_nothing(
     work: Workload, disk: Disk, tmp_path: Path, count: Count
 ) -> None:
-    broken = FaultTrials(work, disk, tmp_path / "disk", disk.inputs)
+    trials = FaultTrials(work, disk, tmp_path / "disk", disk.inputs)
     for stream in STREAMS:
-        broken.clear()
-        given = {"work": work.name, "out": str(broken.out), "stream": stream}
-        status, said = disk.call("server:run_mute", **given)
+        trials.clear()
+        given = {"work": work.name, "out": str(trials.out), "stream": stream}
+        status, said = disk.call("server:run_without_stdout", **given)
         assert status == 0 or (status == 1 and "standard output" in said), (stream, said)
-        assert broken.done, (stream, said, sorted(tmp_path.rglob("*")))
+        assert trials.done, (stream, said, sorted(tmp_path.rglob("*")))
         count("standard output closed or full", cases=1, refused=status, right=1)

@@ -1,4 +1,4 @@
-"""Every command that writes, on inputs so small that hundreds of fault trials are cheap."""
+"""Every command that writes, with inputs so small that hundreds of fault trials are cheap."""
 
 import pickle
 import shutil
@@ -15,8 +15,8 @@ from dmrl.datasets import open_dataset
 from .inputs import Inputs, cli, flights
 
 RECORD_S = 2.5
-TIMED = {"tensorboard", "pipeline.json", "unfinished", "catalogue.parquet"}
-"""Names of what tells when something was made, and differs each time; of what is not done."""
+IGNORED = {"tensorboard", "pipeline.json", "unfinished", "catalogue.parquet"}
+"""Names of files that hold times, and so differ each time, and of unfinished outputs."""
 Run = Callable[[Inputs, Path], object]
 
 
@@ -27,23 +27,23 @@ class Workload:
     Parameters
     ----------
     name
-        Its row.
+        Name of its row in the table.
     run
-        Writes to a path.
+        Runs the command, given the inputs and the path of the output.
     out
-        Name of what it writes.
+        Name of the output.
     keeps
-        What it had done stays unfinished after an error.
+        Whether the unfinished output stays after an error.
     command
-        Which one it is, if its name does not begin so.
+        The command, if the name does not begin with it.
     before
-        What has to be there.
+        Makes what the command needs at the path of the output.
     same
-        Whether it writes the same bytes each time; else they are about as many.
+        Whether it writes the same bytes each time; otherwise only their number is compared.
     pieces
-        Whether its output is a folder whose parts stand by themselves.
+        Whether its output is a folder of independent files.
     reads
-        Who else reads the output, and what each finds: as before or as after, at every moment.
+        Returns what each reader finds in the output: at any time the old or the new content.
     """
 
     name: str
@@ -58,7 +58,7 @@ class Workload:
 
     @property
     def of(self) -> str:
-        """The command."""
+        """The command that it runs."""
         return self.command or self.name.split()[0]
 
 
@@ -72,11 +72,11 @@ def _render(i: Inputs, out: Path) -> None:
     cli("render", i.scene, out, *more)
 
 
-def _copied(i: Inputs, out: Path) -> None:
+def _copy_set(i: Inputs, out: Path) -> None:
     shutil.copytree(i.set, out)
 
 
-def _copied_packed(i: Inputs, out: Path) -> None:
+def _copy_packed_set(i: Inputs, out: Path) -> None:
     shutil.copytree(i.packed, out)
 
 
@@ -84,10 +84,10 @@ def _grow(i: Inputs, out: Path) -> None:
     cli("dataset", i.more, out, "--add")
 
 
-def _rows_read(out: Path) -> dict[str, object]:
-    """Times of the rows that dmrl finds in a dataset, and those that `datasets` finds.
+def _read_rows(out: Path) -> dict[str, object]:
+    """Return the times of the rows of a dataset, as dmrl and as `datasets` read them.
 
-    Of shards in Arrow `datasets` has a list for each split: here one may be longer already.
+    For Arrow shards, `datasets` has a shard list per split, so one split may be newer than another.
     """
     datasets = import_module("datasets")
     opened = open_dataset(out)
@@ -108,7 +108,7 @@ def _card(i: Inputs, out: Path) -> None:
 
 
 def _verify(i: Inputs, out: Path) -> None:
-    """As a step of a pipeline, once gcc has had its say: the command writes nothing."""
+    """Run the step `verify` of a pipeline with a ready result; the command writes nothing."""
     verify, result = import_module("dmrl.stages.verify"), pickle.loads(i.proof.read_bytes())
     proof = import_module("dmrl.deploy.c.run.proof")
     with pytest.MonkeyPatch.context() as patch:
@@ -117,7 +117,7 @@ def _verify(i: Inputs, out: Path) -> None:
 
 
 def _record(i: Inputs, out: Path) -> None:
-    """Two robots for a second, and the robots themselves."""
+    """Record two simulated robots for `RECORD_S`."""
     drones = import_module("dmrl.simulation.drone_fleet")
     uris = ("udp://127.0.0.1:0",) * 2
     with drones.fleet(i.flight, uris, (), drones.DroneSettings()) as fleet:
@@ -163,16 +163,16 @@ WORKLOADS = (
     ),
     Workload("dataset", lambda i, out: cli("dataset", i.dots, out), "set"),
     Workload("dataset to parquet", lambda i, out: cli("dataset", i.dots, out, "--parquet"), "set"),
-    Workload("dataset --add", _grow, "set", before=_copied, pieces=True, reads=_rows_read),
+    Workload("dataset --add", _grow, "set", before=_copy_set, pieces=True, reads=_read_rows),
     Workload(
         "dataset --add to parquet",
         _grow,
         "set",
-        before=_copied_packed,
+        before=_copy_packed_set,
         pieces=True,
-        reads=_rows_read,
+        reads=_read_rows,
     ),
-    Workload("card", _card, "set", before=_copied, pieces=True),
+    Workload("card", _card, "set", before=_copy_set, pieces=True),
     Workload("predict", lambda i, out: cli("predict", i.model, i.dots, out), "a.mcap"),
     Workload("evaluate", lambda i, out: cli("evaluate", i.found, "--plots", out), "plots"),
     Workload("score", lambda i, out: cli("score", out, "--name", "mine"), "score.json"),
@@ -187,7 +187,7 @@ WORKLOADS = (
     Workload("run", lambda i, out: cli("run", i.chain, "--out", out), "chain", pieces=True),
 )
 RECORD = Workload("record", _record, "a.mcap", keeps=True, same=False)
-"""Apart from the others: it writes what comes in, and that is never the same."""
+"""Not in `WORKLOADS`, since its output is never the same."""
 READS: dict[str, Run] = {
     "info": lambda i, _: cli("info", i.dots),
     "info as JSON": lambda i, _: cli("info", i.dots, "--json"),
@@ -201,26 +201,26 @@ READS: dict[str, Run] = {
     ),
     "help": lambda _, __: cli("--help"),
 }
-"""Commands that only say something."""
+"""Commands that only print."""
 
 
 def find_workload(name: str) -> Workload:
-    """The work of that name."""
+    """Return the workload of this name."""
     return next(work for work in (*WORKLOADS, RECORD) if work.name == name)
 
 
-def contents(path: Path) -> dict[str, bytes]:
-    """Everything under a path, by name; what tells times is left out."""
+def read_contents(path: Path) -> dict[str, bytes]:
+    """Return the bytes of every file under a path by relative name, without those `IGNORED`."""
     if path.is_file():
         return {"": path.read_bytes()}
     return {
         str(inner.relative_to(path)): inner.read_bytes()
         for inner in sorted(path.rglob("*"))
-        if inner.is_file() and not TIMED & {*inner.parts}
+        if inner.is_file() and not IGNORED & {*inner.parts}
     }
 
 
-def clear(folder: Path) -> None:
-    """An empty folder."""
+def clear_folder(folder: Path) -> None:
+    """Replace a folder by an empty one."""
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir()

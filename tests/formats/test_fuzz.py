@@ -16,7 +16,7 @@ from dmrl.formats.base import Options
 from dmrl.formats.registry import load_builtin_formats
 from dmrl.messages import message_class
 
-from ..faults.mutate import mutated
+from ..faults.mutate import mutate
 from . import foreign
 
 HANG_S = 20
@@ -165,7 +165,7 @@ def run(which: str, count: int, folder: Path) -> None:
     rng = np.random.default_rng(len(which))
     failed = 0
     for k in range(count):
-        path.write_bytes(mutated(whole, rng))
+        path.write_bytes(mutate(whole, rng))
         signal.alarm(HANG_S)  # ends this process
         try:
             convert(name, source)

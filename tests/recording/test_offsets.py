@@ -10,7 +10,7 @@ from mcap.opcode import Opcode
 from dmrl.recording import read_summary, recover
 
 from ..faults import parts
-from ..faults.ending import ended
+from ..faults.ending import run_to_end
 from ..faults.inputs import Inputs, cli
 
 pytestmark = pytest.mark.heavy
@@ -58,9 +58,9 @@ def test_invalid_offset_gives_one_line_error_and_loses_nothing(
     for at in FIELDS[opcode]:
         bad.write_bytes(replace_offset(data, opcode, at, number))
         for command in ("info", "check"):
-            status, output = ended(lambda c=command: cli(c, bad))
+            status, output = run_to_end(lambda c=command: cli(c, bad))
             assert status == 0 or "bad.mcap" in output
-        status, output = ended(lambda: cli("trim", bad, out))
+        status, output = run_to_end(lambda: cli("trim", bad, out))
         assert (status == 0) == out.exists() and (status == 0 or "dmrl recover" in output), output
         if status == 0:
             assert read_summary(out).topics == read_summary(sound).topics

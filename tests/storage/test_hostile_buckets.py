@@ -19,7 +19,7 @@ from dmrl.guards import limits
 from dmrl.storage import bucket, to_path
 from dmrl.storage.system import get_filesystem
 
-from ..faults.ending import ended
+from ..faults.ending import run_to_end
 from ..faults.inputs import Inputs, cli
 from ..local_server import serve_locally
 
@@ -251,7 +251,7 @@ def test_endless_listing_is_stopped(
     store.wrong = wrong
     with pytest.raises(StorageError, match=said):
         to_path("s3://lab/set").list_files()  # type: ignore[attr-defined]
-    status, text = ended(lambda: cli("trim", "s3://lab/set", tmp_path / "out"))
+    status, text = run_to_end(lambda: cli("trim", "s3://lab/set", tmp_path / "out"))
     assert status == 1 and text.count("\n") <= 1 and not list(tmp_path.iterdir()), text
     assert store.most_sent < SENT_BYTES_MAX
 
@@ -276,7 +276,7 @@ def test_bucket_bytes_beyond_the_request_are_not_read(
     store.wrong = wrong
     for command in ("info", "check"):
         store.reads = 0
-        status, text = ended(lambda c=command: cli(c, "s3://lab/a.mcap"))
+        status, text = run_to_end(lambda c=command: cli(c, "s3://lab/a.mcap"))
         assert status == (0 if said is None else 1) and (said or "") in text, text
     assert store.most_sent < SENT_BYTES_MAX and not store.inner_reads
 
@@ -300,7 +300,7 @@ def test_an_upload_that_is_not_stored_is_an_error(wrong: str, store: Store) -> N
     with pytest.raises(StorageError), atomic_folder(folder) as here:
         (here / "b").write_bytes(b"a dataset")
     assert list(store.objects) == ["a.mcap"]
-    status, output = ended(lambda: cli("trim", "s3://lab/a.mcap", "s3://lab/b.mcap"))
+    status, output = run_to_end(lambda: cli("trim", "s3://lab/a.mcap", "s3://lab/b.mcap"))
     assert status == 1 and "s3://lab/b.mcap: the server does not store" in output, output
 
 
@@ -313,5 +313,5 @@ def test_a_key_with_control_characters_becomes_no_file(
     monkeypatch.setattr(get_filesystem("s3"), "find", lambda _: names)
     with pytest.raises(StorageError, match="cannot be a path"):
         list(folder.iterdir())
-    status, output = ended(lambda: cli("trim", folder, tmp_path / "out"))
+    status, output = run_to_end(lambda: cli("trim", folder, tmp_path / "out"))
     assert status == 1 and output.isprintable() and not list(tmp_path.iterdir()), output
