@@ -1,3 +1,5 @@
+"""Fixtures: a simulated flight and its dataset."""
+
 from pathlib import Path
 
 import pytest
@@ -7,7 +9,7 @@ import dmrl
 
 @pytest.fixture(scope="session")
 def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two robots for 6 s, with a picture every half second."""
+    """Simulate two robots for 6 s, with an image every half second."""
     out = tmp_path_factory.mktemp("api") / "flight.mcap"
     dmrl.fly(out, duration_s=6.0, noise="calibrated", camera=True, camera_rate_hz=2.0, seed=3)
     return out
@@ -15,5 +17,5 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def data(flight: Path) -> Path:
-    """The dataset of it."""
+    """Build the dataset of the flight."""
     return dmrl.make_dataset([flight], flight.with_name("set")).path

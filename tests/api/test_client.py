@@ -1,4 +1,4 @@
-"""Type checks of a program that uses dmrl: mypy --strict passes it, and finds its errors."""
+"""mypy --strict accepts a correct program that uses dmrl, and finds errors in a wrong one."""
 
 import subprocess
 import sys
@@ -34,7 +34,7 @@ def learn(path: Path) -> float:
 
 @pytest.fixture(scope="module")
 def layout(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Sources as they are installed, where mypy finds viewer/ and the like below dmrl/."""
+    """Link the sources as they are installed, with viewer/, schemas/ and recipes/ in dmrl/."""
     folder = tmp_path_factory.mktemp("layout")
     (folder / "dmrl").mkdir()
     for part in [*(ROOT / "dmrl").iterdir(), *(ROOT / n for n in ("viewer", "schemas", "recipes"))]:
@@ -42,9 +42,10 @@ def layout(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def strict(layout: Path, program: str) -> tuple[int, str]:
+def check_types(layout: Path, program: str) -> tuple[int, str]:
+    """Check a program with mypy; return the exit status and the output."""
     (layout / "client.py").write_text(program)
-    # Strict, and without what other packages lack: as dmrl itself is checked.
+    # Use dmrl's own configuration: strict, but without errors of untyped packages.
     words = ["--config-file", str(ROOT / "pyproject.toml"), "--cache-dir", str(layout / "cache")]
     done = subprocess.run(
         [sys.executable, "-m", "mypy", *words, "client.py"],
@@ -59,7 +60,7 @@ def strict(layout: Path, program: str) -> tuple[int, str]:
 @pytest.mark.slow
 @pytest.mark.timeout(3000)
 def test_a_client_is_typed(layout: Path) -> None:
-    assert strict(layout, CLIENT) == (0, "Success: no issues found in 1 source file\n")
+    assert check_types(layout, CLIENT) == (0, "Success: no issues found in 1 source file\n")
     wrong = CLIENT.replace("found[0][0].depth_m", "found[0][0].depth")
-    status, said = strict(layout, wrong)
+    status, said = check_types(layout, wrong)
     assert status == 1 and 'has no attribute "depth"' in said

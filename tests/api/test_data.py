@@ -29,7 +29,7 @@ def test_dataset_rows_equal_arrays_of_the_split(data: Path) -> None:
 
 
 @pytest.mark.heavy
-def test_a_frame_has_the_peers(data: Path) -> None:
+def test_data_frame_has_the_peers(data: Path) -> None:
     rows = dmrl.dataset(data)["train"]
     frame = rows.to_pandas()
     peers = [p["u_px"] for row in rows.to_arrow()["peers"].to_pylist() for p in row]

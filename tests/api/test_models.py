@@ -19,7 +19,7 @@ def test_detections_equal_dmrl_predict(flight: Path, tmp_path: Path) -> None:
     said = predicted.detections("cf1")
     said = said[said["confidence"] >= 0.05]
     assert len(found) == len(images)
-    # predict has other images in its batches, so its sums are rounded otherwise.
+    # predict batches the images differently, so its sums are rounded differently.
     for name, most in (("u_px", 1e-3), ("depth_m", 1e-4), ("confidence", 1e-4)):
         ours = [getattr(d, name) for image in found for d in image]
         assert np.allclose(ours, said[name], rtol=0, atol=most)

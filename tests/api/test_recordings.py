@@ -1,4 +1,4 @@
-"""The Python interface to recordings: the contents of the file."""
+"""The Python interface to recordings: topics, tables, images, labels and errors."""
 
 from pathlib import Path
 
@@ -137,7 +137,7 @@ def test_unknown_field_or_time_is_reported(tmp_path: Path) -> None:
 
 
 def test_integers_stay_exact_beside_absent_ones(tmp_path: Path) -> None:
-    """A float would round them."""
+    """As floats, which can be NaN, large integers would be rounded."""
     with dmrl.writer(tmp_path / "a.mcap") as out:
         out.write("/cf1/tracks", 0.0, {"tracks": [{"id": 7}]})
         out.write("/cf1/tracks", 0.1, {"tracks": []})

@@ -1,3 +1,5 @@
+"""Export of recordings to CSV and Parquet tables."""
+
 import base64
 import csv
 import json
@@ -21,7 +23,7 @@ PNG = encode_png(np.full((4, 4, 3), 7, np.uint8))
 
 @pytest.fixture
 def recording(tmp_path: Path) -> Path:
-    """A picture, labels with two peers, one and none, a pose and a map."""
+    """Write an image, labels with two, one and no peers, a pose and a grid map."""
     path = tmp_path / "in.mcap"
     peers = [{"peer": "cf2", "u_px": 1.5, "box_px": [1, 2, 3, 4]}, {"peer": "cf3", "u_px": 2.5}]
     with RecordingWriter(path, build_provenance("test")) as sink:
@@ -56,7 +58,7 @@ def test_exported_tables_equal_the_recording(recording: Path, tmp_path: Path, ki
     assert labels["log_time"].tolist() == [0, 0, 10, 20]
     assert labels["publish_time"].tolist() == [1, 1, 11, 21]
     assert labels["peers.peer"].tolist()[:3] == ["cf2", "cf3", "cf2"]
-    assert pd.isna(labels["peers.peer"][3])  # nobody is in view
+    assert pd.isna(labels["peers.peer"][3])  # the labels without peers
     assert labels["peers.u_px"].tolist()[:3] == [1.5, 2.5, 1.5]
     box = labels["peers.box_px"][0]
     assert (json.loads(box) if kind == "csv" else box.tolist()) == [1, 2, 3, 4]
@@ -69,7 +71,7 @@ def test_exported_tables_equal_the_recording(recording: Path, tmp_path: Path, ki
 
 
 def test_items_of_two_lists_of_a_message_are_paired() -> None:
-    """Also where one holds lists; not in their product."""
+    """The rows are the pairs and not all combinations, also if an item holds a list itself."""
     table = pa.table(
         {
             "log_time": [1, 2, 3],
@@ -115,7 +117,7 @@ def test_similar_topics_have_separate_tables(tmp_path: Path, kind: str) -> None:
 def test_topics_with_colliding_file_names_are_refused(
     recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As where A and a are one name of a file."""
+    """File systems that ignore case have one file for A and a."""
     monkeypatch.setattr(csv_parquet, "to_topic_file_name", lambda topic: topic[:4].strip("/"))
     with pytest.raises(UnsafeName, match=r"/cf1/.* and another topic would both become"):
         write_tables(recording, tmp_path / "out", "csv")
@@ -155,7 +157,7 @@ def test_no_text_of_a_csv_is_a_formula(tmp_path: Path, kind: str, text: str) -> 
     else:
         (row,) = pd.read_parquet(file).to_dict("records")
     assert row["peers.peer"] == (text if as_it_is else f"'{text}")
-    assert float(row["peers.u_px"]) == -1.5  # a number stays one
+    assert float(row["peers.u_px"]) == -1.5  # negative numbers stay numbers
 
 
 def test_two_pictures_of_one_time_are_two_files(tmp_path: Path) -> None:

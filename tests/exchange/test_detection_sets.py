@@ -1,4 +1,4 @@
-"""Datasets in other formats, read by their own libraries and converted back within 0.01 px."""
+"""Datasets exported to other formats: their own libraries read them, and they convert back."""
 
 import gc
 import json
@@ -34,8 +34,8 @@ SPLITS = {"train": f"[[0, {5 * STEP_NS}]]", "val": f"[[{6 * STEP_NS}, {8 * STEP_
 INFINITE = float("inf")
 
 
-def peers_of(k: int) -> list[dict[str, Any]]:
-    """Labels of image k: nobody, one robot with a depth, or two of which one has none."""
+def build_peers(k: int) -> list[dict[str, Any]]:
+    """Build the labels of image k: none, one robot with a depth, or also one without."""
     rng = np.random.default_rng(k)
     found: list[dict[str, Any]] = []
     for n in range(k % 3):
@@ -57,17 +57,18 @@ def peers_of(k: int) -> list[dict[str, Any]]:
     return found
 
 
-def pixels_of(k: int) -> np.ndarray:
+def draw_noise(k: int) -> np.ndarray:
+    """Draw the noise image k, (HEIGHT, WIDTH, 3)."""
     return np.random.default_rng(100 + k).integers(0, 256, (HEIGHT, WIDTH, 3), np.uint8)
 
 
-def write(path: Path, without_box: int | None = None) -> Path:
+def write_recording(path: Path, without_box: int | None = None) -> Path:
     """Write a recording with nine labelled images, and a split."""
     with RecordingWriter(path, Provenance("test")) as sink:
         sink.add_metadata(SPLIT_METADATA, SPLITS)
         for k in range(COUNT):
-            image = message_class("CompressedImage")(data=encode_png(pixels_of(k)), format="png")
-            peers = peers_of(k)
+            image = message_class("CompressedImage")(data=encode_png(draw_noise(k)), format="png")
+            peers = build_peers(k)
             if k == without_box:
                 peers = [{**peers[0], "box_px": []}, *peers[1:]]
             labels = message_class("PeerLabels")(peers=peers, sources=["hand"])
@@ -78,44 +79,47 @@ def write(path: Path, without_box: int | None = None) -> Path:
 
 @pytest.fixture
 def source(tmp_path: Path) -> Path:
-    """A dataset of one recording, with the splits train and val."""
-    dataset.run([write(tmp_path / "flight.mcap")], tmp_path / "set", dataset.Settings())
+    """Build a dataset of one recording, with the splits train and val."""
+    dataset.run([write_recording(tmp_path / "flight.mcap")], tmp_path / "set", dataset.Settings())
     return tmp_path / "set"
 
 
-def export(source: Path, to: str, **flags: Any) -> Path:
+def export_set(source: Path, to: str, **flags: Any) -> Path:
+    """Convert a dataset to a format and return the output folder."""
     out = source.parent / f"out-{to}"
     counts = convert.run(source, out, convert.Settings(to=to, **flags))  # type: ignore[arg-type]
     assert counts == {"train": 6, "val": 3}
     return out
 
 
-def labels_of(recording: Path) -> Iterator[list[Any]]:
+def iter_labels(recording: Path) -> Iterator[list[Any]]:
+    """Yield the list of labels of each image."""
     for stamped in read(recording, LABELS("cf1")):
         yield list(stamped.message.peers)
 
 
-def boxes_of(k: int) -> np.ndarray:
-    return np.array([peer["box_px"] for peer in peers_of(k)]).reshape(-1, 4)
+def get_boxes(k: int) -> np.ndarray:
+    """Return the boxes of image k, (N, 4) pixels."""
+    return np.array([peer["box_px"] for peer in build_peers(k)]).reshape(-1, 4)
 
 
 def test_supervision_reads_yolo(source: Path) -> None:
     sv = pytest.importorskip("supervision")
-    out = export(source, "yolo")
+    out = export_set(source, "yolo")
     for split, first in (("train", 0), ("val", 6)):
         found = sv.DetectionDataset.from_yolo(
             str(out / "images" / split), str(out / "labels" / split), str(out / "data.yaml")
         )
         assert found.classes == ["drone"]
         for k, path in enumerate(sorted(found.image_paths), first):
-            np.testing.assert_allclose(found.annotations[path].xyxy, boxes_of(k), atol=0.01)
+            np.testing.assert_allclose(found.annotations[path].xyxy, get_boxes(k), atol=0.01)
             assert set(found.annotations[path].class_id) <= {0}
     assert found[0][1].shape == (HEIGHT, WIDTH, 3)
 
 
 def test_pycocotools_reads_coco(source: Path) -> None:
     coco = pytest.importorskip("pycocotools.coco")
-    out = export(source, "coco", names="drone=robot")
+    out = export_set(source, "coco", names="drone=robot")
     for split, first in (("train", 0), ("val", 6)):
         found = coco.COCO(str(out / "annotations" / f"instances_{split}.json"))
         assert [c["name"] for c in found.loadCats(found.getCatIds())] == ["robot"]
@@ -123,33 +127,33 @@ def test_pycocotools_reads_coco(source: Path) -> None:
             (image,) = found.loadImgs(number)
             assert (image["width"], image["height"]) == (WIDTH, HEIGHT)
             assert image["log_time"] == k * STEP_NS
-            assert (out / split / image["file_name"]).read_bytes() == encode_png(pixels_of(k))
+            assert (out / split / image["file_name"]).read_bytes() == encode_png(draw_noise(k))
             own = found.loadAnns(found.getAnnIds(imgIds=number))
             boxes = np.array([a["bbox"] for a in own]).reshape(-1, 4)
             boxes[:, 2:] += boxes[:, :2]
-            np.testing.assert_allclose(boxes, boxes_of(k), atol=1e-9)
-            for annotation, peer in zip(own, peers_of(k), strict=True):
+            np.testing.assert_allclose(boxes, get_boxes(k), atol=1e-9)
+            for annotation, peer in zip(own, build_peers(k), strict=True):
                 assert annotation["attributes"].get("depth_m", 0) == pytest.approx(peer["depth_m"])
 
 
 @pytest.mark.parametrize("to", ["yolo", "coco"])
 def test_boxes_round_trip_within_a_hundredth_of_a_pixel(to: str, source: Path) -> None:
-    out = export(source, to)
+    out = export_set(source, to)
     again = source.parent / "again.mcap"
     with count_left_out() as counted:
         convert.run(out, again, convert.Settings())
     assert not counted.counts
-    found = list(labels_of(again))
+    found = list(iter_labels(again))
     assert len(found) == COUNT
     for k, peers in enumerate(found):
-        assert [peer.peer for peer in peers] == [peer["peer"] for peer in peers_of(k)]
+        assert [peer.peer for peer in peers] == [peer["peer"] for peer in build_peers(k)]
         boxes = np.array([peer.box_px for peer in peers]).reshape(-1, 4)
-        np.testing.assert_allclose(boxes, boxes_of(k), atol=0.01)
-        for peer, want in zip(peers, peers_of(k), strict=True) if to == "coco" else ():
+        np.testing.assert_allclose(boxes, get_boxes(k), atol=0.01)
+        for peer, want in zip(peers, build_peers(k), strict=True) if to == "coco" else ():
             assert (peer.u_px, peer.depth_m) == pytest.approx((want["u_px"], want["depth_m"]))
             assert (peer.sigma_u_px, peer.sigma_depth_m) == (0.5, want["sigma_depth_m"])
     images = [s.message.data for s in read(again, CAMERA_IMAGE("cf1"))]
-    assert images == [encode_png(pixels_of(k)) for k in range(COUNT)]
+    assert images == [encode_png(draw_noise(k)) for k in range(COUNT)]
     splits = read_splits(again, read_summary(again))
     spans = {name: [tuple(span) for span in own] for name, own in splits.items()}
     assert spans == {"train": [(0, 500_000_000)], "val": [(600_000_000, 800_000_000)]}
@@ -159,27 +163,27 @@ def test_boxes_round_trip_within_a_hundredth_of_a_pixel(to: str, source: Path) -
 def test_webdataset_reads_its_shards(source: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     wds = pytest.importorskip("webdataset")
     monkeypatch.setattr("dmrl.exchange.detection_sets.SHARD_IMAGES", 4)
-    out = export(source, "webdataset")
+    out = export_set(source, "webdataset")
     names = ["train-000000.tar", "train-000001.tar", "val-000000.tar"]
     assert sorted(path.name for path in out.glob("*.tar")) == names
     urls = [str(out / name) for name in names]
     rows = list(wds.WebDataset(urls, shardshuffle=False).decode("rgb8"))
-    gc.collect()  # it leaves files open
+    gc.collect()  # closes files that webdataset leaves open
     assert len(rows) == COUNT
     for k, row in enumerate(rows):
-        np.testing.assert_array_equal(row["png"], pixels_of(k))
+        np.testing.assert_array_equal(row["png"], draw_noise(k))
         told = row["json"]
         assert (told["log_time"], told["robot"]) == (k * STEP_NS, "cf1")
         assert told["split"] == ("train" if k < 6 else "val")
         assert told["recording"] == "flight.mcap"
-        for peer, want in zip(told["peers"], peers_of(k), strict=True):
+        for peer, want in zip(told["peers"], build_peers(k), strict=True):
             assert peer["box_px"] == want["box_px"]
             assert peer["class"] == "drone"
             assert peer.get("depth_m") == (want["depth_m"] or None)
 
 
-def _features(info: dict[str, Any]) -> Any:
-    """The types of a LeRobot dataset's columns, by the rule of lerobot.datasets.utils."""
+def build_features(info: dict[str, Any]) -> Any:
+    """Build the features of a LeRobot dataset as lerobot.datasets.utils does."""
     hf = pytest.importorskip("datasets")
     types = {}
     for key, feature in info["features"].items():
@@ -193,7 +197,7 @@ def _features(info: dict[str, Any]) -> Any:
 def test_lerobot_s_layout_is_read_by_its_schema(source: Path) -> None:
     hf = pytest.importorskip("datasets")
     pandas = pytest.importorskip("pandas")
-    out = export(source, "lerobot")
+    out = export_set(source, "lerobot")
     info = json.loads((out / "meta/info.json").read_text())
     assert (info["codebase_version"], info["fps"]) == ("v3.0", 20)
     assert (info["total_episodes"], info["total_frames"], info["total_tasks"]) == (2, 9, 1)
@@ -209,21 +213,21 @@ def test_lerobot_s_layout_is_read_by_its_schema(source: Path) -> None:
     ]
     paths = [str(out / file) for file in files]
     cache = str(source.parent / "cache")
-    rows = hf.Dataset.from_parquet(paths, features=_features(info), cache_dir=cache)
+    rows = hf.Dataset.from_parquet(paths, features=build_features(info), cache_dir=cache)
     assert rows["index"][:] == list(range(COUNT))
     assert rows["episode_index"][:] == [0] * 6 + [1] * 3
     for k, row in enumerate(rows):
-        np.testing.assert_array_equal(np.asarray(row["observation.images.camera"]), pixels_of(k))
+        np.testing.assert_array_equal(np.asarray(row["observation.images.camera"]), draw_noise(k))
         frame = k if k < 6 else k - 6
         assert row["timestamp"] == pytest.approx(frame / 20)
         assert row["log_time"] == k * STEP_NS
-        peers = peers_of(k)
+        peers = build_peers(k)
         for name in ("u_px", "v_px", "depth_m"):
             want = [peer[name] if peer[name] else np.nan for peer in peers]
             want += [np.nan] * (2 - len(want))
             np.testing.assert_allclose(row[f"labels.{name}"], want, atol=0.001)
         edges = [row[f"labels.{name}_px"][: len(peers)] for name in ("left", "top")]
-        np.testing.assert_allclose(np.array(edges).T, boxes_of(k)[:, :2], atol=0.001)
+        np.testing.assert_allclose(np.array(edges).T, get_boxes(k)[:, :2], atol=0.001)
 
 
 READ_BY_LEROBOT = """
@@ -246,33 +250,39 @@ def test_lerobot_reads_it(source: Path, tmp_path: Path) -> None:
     python = os.environ.get("DMRL_LEROBOT_PYTHON")
     if not python:
         pytest.skip("lerobot needs an environment of its own: make test-lerobot")
-    read_by_lerobot = [python, "-c", READ_BY_LEROBOT, export(source, "lerobot"), tmp_path / "rows"]
+    read_by_lerobot = [
+        python,
+        "-c",
+        READ_BY_LEROBOT,
+        export_set(source, "lerobot"),
+        tmp_path / "rows",
+    ]
     subprocess.run(read_by_lerobot, check=True, env={**os.environ, "HF_HUB_OFFLINE": "1"})
     rows = np.load(tmp_path / "rows.npz")
     assert rows["episode_index"].tolist() == [0] * 6 + [1] * 3
     assert rows["log_time"].tolist() == [k * STEP_NS for k in range(COUNT)]
     for k, image in enumerate(rows["images"]):
-        np.testing.assert_allclose(image.transpose(1, 2, 0) * 255, pixels_of(k), atol=0.001)
-        count = len(peers_of(k))
+        np.testing.assert_allclose(image.transpose(1, 2, 0) * 255, draw_noise(k), atol=0.001)
+        count = len(build_peers(k))
         box = [rows[f"labels.{name}_px"][k] for name in ("left", "top", "right", "bottom")]
-        np.testing.assert_allclose(np.array(box).T[:count], boxes_of(k), atol=0.01)
+        np.testing.assert_allclose(np.array(box).T[:count], get_boxes(k), atol=0.01)
         assert np.isnan(np.array(box).T[count:]).all()
-        depths = [peer["depth_m"] or np.nan for peer in peers_of(k)]
+        depths = [peer["depth_m"] or np.nan for peer in build_peers(k)]
         np.testing.assert_allclose(rows["labels.depth_m"][k][:count], depths, atol=1e-5)
 
 
 @pytest.mark.parametrize("to", ["yolo", "coco", "lerobot", "webdataset"])
 def test_the_same_dataset_gives_the_same_bytes(to: str, source: Path) -> None:
-    first = export(source, to)
+    first = export_set(source, to)
     kept = {p.relative_to(first): p.read_bytes() for p in first.rglob("*") if p.is_file()}
     first.rename(first.with_name("first"))
-    again = export(source, to)
+    again = export_set(source, to)
     assert kept == {p.relative_to(again): p.read_bytes() for p in again.rglob("*") if p.is_file()}
 
 
 @pytest.mark.parametrize("to", ["yolo", "coco"])
 def test_a_label_without_a_box_needs_the_width_of_the_robot(to: str, tmp_path: Path) -> None:
-    recording = write(tmp_path / "flight.mcap", without_box=1)
+    recording = write_recording(tmp_path / "flight.mcap", without_box=1)
     dataset.run([recording], tmp_path / "set", dataset.Settings())
     with count_left_out() as counted:
         counts = convert.run(tmp_path / "set", tmp_path / "out", convert.Settings(to=to))
@@ -287,9 +297,9 @@ def test_a_label_without_a_box_needs_the_width_of_the_robot(to: str, tmp_path: P
     flags = {"robot_width_m": 0.1, "camera": tmp_path / "camera.toml"}
     convert.run(tmp_path / "set", tmp_path / "more", convert.Settings(to=to, **flags))
     convert.run(tmp_path / "more", tmp_path / "back.mcap", convert.Settings())
-    (peer,) = list(labels_of(tmp_path / "back.mcap"))[1]
+    (peer,) = list(iter_labels(tmp_path / "back.mcap"))[1]
     left, _, right, _ = peer.box_px
-    assert right - left == pytest.approx(40 * 0.1 / peers_of(1)[0]["depth_m"], abs=0.01)
+    assert right - left == pytest.approx(40 * 0.1 / build_peers(1)[0]["depth_m"], abs=0.01)
 
 
 def test_invalid_export_gives_one_line_error(source: Path, tmp_path: Path) -> None:
@@ -305,7 +315,7 @@ def test_invalid_export_gives_one_line_error(source: Path, tmp_path: Path) -> No
 
 def test_export_without_boxes_gives_one_line_error(tmp_path: Path) -> None:
     with RecordingWriter(tmp_path / "flight.mcap", Provenance("test")) as sink:
-        image = message_class("CompressedImage")(data=encode_png(pixels_of(0)), format="png")
+        image = message_class("CompressedImage")(data=encode_png(draw_noise(0)), format="png")
         peer = {"peer": "cf2", "u_px": 9, "v_px": 9, "depth_m": 1, "source": "hand"}
         sink.write(0, CAMERA_IMAGE("cf1"), image)
         sink.write(0, LABELS("cf1"), message_class("PeerLabels")(peers=[peer]))

@@ -1,4 +1,4 @@
-"""Options of `dmrl convert --to` that fit no dataset, and datasets of several cameras."""
+"""Options of `dmrl convert --to` that do not apply, and datasets of several cameras."""
 
 import json
 from pathlib import Path
@@ -23,7 +23,7 @@ CAMERA = "width_px = {}\nheight_px = {}\nfx_px = 40.0\nfy_px = 40.0\ncx_px = 32.
 
 @pytest.fixture
 def source(tmp_path: Path) -> Path:
-    """A dataset of two robots whose cameras take images at the same times."""
+    """Build a dataset of two robots whose cameras take images at the same times."""
     with RecordingWriter(tmp_path / "flight.mcap", Provenance("test")) as sink:
         for k, robot in ((k, robot) for k in range(COUNT) for robot in ("cf1", "cf2")):
             rgb = np.full((HEIGHT, WIDTH, 3), 10 * k + int(robot[2:]), np.uint8)

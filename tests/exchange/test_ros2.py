@@ -1,3 +1,5 @@
+"""Export of recordings to ROS 2 bags, read by rosbags and converted back."""
+
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +18,7 @@ STAMP = {"seconds": 3, "nanos": 5}
 
 @pytest.fixture
 def recording(tmp_path: Path) -> Path:
-    """One message of every kind that there is."""
+    """Write a recording with one message of every type of dmrl."""
     path = tmp_path / "in.mcap"
     k = [100.0, 0, 2.5, 0, 101.0, 1.5, 0, 0, 1]
     messages = {
@@ -72,7 +74,7 @@ def test_rosbags_reader_finds_every_exported_message(recording: Path, tmp_path: 
             decoded = reader.deserialize(data, connection.msgtype)
             assert time_ns in (3_000_000_005, 3_000_000_006)
             if connection.topic == "/cf1/camera/calibration":
-                # ROS counts from the middle of the first pixel, dmrl from its edge.
+                # The pixel origin of ROS is the centre of the first pixel, dmrl's its corner.
                 assert decoded.k[[0, 2, 5]].tolist() == [100.0, 2.0, 1.0]
             if connection.topic == "/cf1/labels":
                 assert (decoded.peers[0].peer, decoded.peers[0].status) == ("cf2", 2)
@@ -89,7 +91,7 @@ def test_exported_bag_converts_back_to_the_recording(recording: Path, tmp_path: 
     convert.run(tmp_path / "bag", again, convert.Settings())
     before = {t: [s.message for s in read(recording, t)] for t in read_summary(recording).topics}
     after = {t: [s.message for s in read(again, t)] for t in read_summary(again).topics}
-    # A calibration is said once; log variables come back with other names of their fields.
+    # A calibration is written once; fields of log variables come back with other names.
     assert len(after["/cf1/camera/calibration"]) == 1
     assert len(after.pop("/cf1/log/state")) == len(before.pop("/cf1/log/state"))
     before["/cf1/camera/calibration"].pop()

@@ -1,4 +1,4 @@
-"""Recordings of unknown types exported to bags and tables: complete, or a one-line error."""
+"""Messages of unknown types are exported to bags and tables completely, or left out by name."""
 
 import re
 from pathlib import Path
@@ -28,8 +28,10 @@ OWN = {"type": F.TYPE_MESSAGE, "type_name": ".x.M"}
 MANY = {"label": F.LABEL_REPEATED}
 
 
-def recorded(folder: Path, *fields: dict[str, Any], data: bytes = b"", name: str = "M") -> Path:
-    """A recording with one message of a type of these fields."""
+def write_message(
+    folder: Path, *fields: dict[str, Any], data: bytes = b"", name: str = "M"
+) -> Path:
+    """Write a recording with one message, of a new type with these fields."""
     file = FileDescriptorProto(name="x.proto", package="x", syntax="proto3")
     kind = file.message_type.add(name=name)
     entry = kind.nested_type.add(name="Entry")
@@ -58,7 +60,7 @@ def recorded(folder: Path, *fields: dict[str, Any], data: bytes = b"", name: str
 def test_fields_of_a_bag_have_names_that_ros_takes(
     names: list[str], wanted: list[str], tmp_path: Path
 ) -> None:
-    path = recorded(tmp_path, *({"name": name} for name in names))
+    path = write_message(tmp_path, *({"name": name} for name in names))
     write_bag(path, tmp_path / "bag")
     with AnyReader([tmp_path / "bag"]) as reader:
         ((connection, _, data),) = reader.messages()
@@ -68,16 +70,16 @@ def test_fields_of_a_bag_have_names_that_ros_takes(
 
 @pytest.mark.parametrize(("name", "wanted"), [("_", "Type"), ("_1", "Type1"), ("class", "Class")])
 def test_types_of_a_bag_have_names_that_ros_takes(name: str, wanted: str, tmp_path: Path) -> None:
-    write_bag(recorded(tmp_path, {}, name=name), tmp_path / "bag")
+    write_bag(write_message(tmp_path, {}, name=name), tmp_path / "bag")
     with AnyReader([tmp_path / "bag"]) as reader:
         assert [c.msgtype for c in reader.connections] == [f"dmrl_msgs/msg/{wanted}"]
 
 
 @pytest.mark.parametrize("kind", [F.TYPE_SFIXED32, F.TYPE_SFIXED64])
-def test_every_whole_number_is_one_in_a_bag(kind: int, tmp_path: Path) -> None:
+def test_integers_of_every_type_are_integers_in_a_bag(kind: int, tmp_path: Path) -> None:
     size = 4 if kind == F.TYPE_SFIXED32 else 8
     data = bytes([8 | (5 if size == 4 else 1)]) + (-7).to_bytes(size, "little", signed=True)
-    write_bag(recorded(tmp_path, {"type": kind}, data=data), tmp_path / "bag")
+    write_bag(write_message(tmp_path, {"type": kind}, data=data), tmp_path / "bag")
     with AnyReader([tmp_path / "bag"]) as reader:
         ((connection, _, sent),) = reader.messages()
         assert reader.deserialize(sent, connection.msgtype).a == -7
@@ -96,7 +98,7 @@ def test_every_whole_number_is_one_in_a_bag(kind: int, tmp_path: Path) -> None:
 def test_types_without_ros_equivalent_are_omitted(
     field: dict[str, Any], words: str, tmp_path: Path
 ) -> None:
-    path = recorded(tmp_path, field)
+    path = write_message(tmp_path, field)
     with (
         pytest.raises(RecordingError, match=r"in.mcap has nothing that ROS 2 can hold"),
         count_left_out() as left_out,
@@ -114,14 +116,14 @@ def test_types_without_ros_equivalent_are_omitted(
 
 
 def test_a_list_of_bytes_is_base64_in_a_table(tmp_path: Path) -> None:
-    path = recorded(tmp_path, {"type": F.TYPE_BYTES, **MANY}, data=b"\x0a\x01a\x0a\x01\xff")
+    path = write_message(tmp_path, {"type": F.TYPE_BYTES, **MANY}, data=b"\x0a\x01a\x0a\x01\xff")
     write_tables(path, tmp_path / "out", "csv")
     assert pd.read_csv(tmp_path / "out" / "cf1.m.csv")["a"][0] == '["YQ==", "/w=="]'
 
 
 @pytest.mark.parametrize("kind", ["csv", "parquet"])
 def test_a_topic_with_text_that_is_not_utf_8_is_left_out(kind: str, tmp_path: Path) -> None:
-    path = recorded(tmp_path, {"type": F.TYPE_STRING}, data=b"\x0a\x02\xed\xa0")
+    path = write_message(tmp_path, {"type": F.TYPE_STRING}, data=b"\x0a\x02\xed\xa0")
     with (
         pytest.raises(RecordingError, match="has no topic that can be read"),
         count_left_out() as left_out,
@@ -129,6 +131,6 @@ def test_a_topic_with_text_that_is_not_utf_8_is_left_out(kind: str, tmp_path: Pa
         write_tables(path, tmp_path / "out", kind)  # type: ignore[arg-type]
     why = "has messages that are not of its type (a text is not UTF-8)"
     assert left_out.counts == {f"messages on /cf1/m, which {why}": 1}
-    with pytest.raises(UnreadableTopic, match=r"Leave it out \(dmrl trim\)"):  # recover cannot help
+    with pytest.raises(UnreadableTopic, match=r"Leave it out \(dmrl trim\)"):
         read_table(path, "/cf1/m")
     assert list(tmp_path.iterdir()) == [path]

@@ -1,3 +1,5 @@
+"""Camera files: round trip, and refusal of wrong keys and numbers."""
+
 from pathlib import Path
 
 import pytest
@@ -50,7 +52,7 @@ def test_a_missing_file_is_named(tmp_path: Path) -> None:
     ("key", "value", "good"),
     [
         ("fx_px", "-183.0", False),
-        ("cx_px", "-183.0", True),  # beside the image, as of a crop
+        ("cx_px", "-183.0", True),  # outside the image, as in a cropped one
         ("cy_px", "inf", False),
         ("delay_s", "-inf", False),
         ("delay_s", "-0.1", True),

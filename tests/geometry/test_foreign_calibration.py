@@ -1,4 +1,4 @@
-"""Calibration files of ROS, Kalibr and OpenCV, as these write them."""
+"""Reading of camera calibration files that ROS, Kalibr, EuRoC and OpenCV write."""
 
 import json
 from pathlib import Path
@@ -51,29 +51,29 @@ p: [210.0, 0.0, 160.0, 0.0, 0.0, 211.0, 119.0, 0.0, 0.0, 0.0, 1.0, 0.0]
 """
 
 
-def write(path: Path, text: str) -> Path:
+def write_text(path: Path, text: str) -> Path:
     path.write_text(text)
     return path
 
 
 @pytest.mark.parametrize("text", [ROS, MESSAGE, f"{MESSAGE}---\n", f"---\n{MESSAGE}---\n{MESSAGE}"])
 def test_files_of_ros(text: str, tmp_path: Path) -> None:
-    assert read_camera(write(tmp_path / "camera.yaml", text)) == WANTED
+    assert read_camera(write_text(tmp_path / "camera.yaml", text)) == WANTED
 
 
 def test_a_file_of_kalibr_has_four_coefficients(tmp_path: Path) -> None:
-    found = read_camera(write(tmp_path / "camchain.yaml", KALIBR))
+    found = read_camera(write_text(tmp_path / "camchain.yaml", KALIBR))
     assert found == Camera(320, 240, 210.0, 211.0, 160.5, 119.5, D[:4])
     two = KALIBR + KALIBR.replace("cam0", "cam1")
     with pytest.raises(SourceError, match="it has cam0, cam1; keep one"):
-        read_camera(write(tmp_path / "two.yaml", two))
+        read_camera(write_text(tmp_path / "two.yaml", two))
 
 
 def test_a_sensor_file_of_euroc_is_one_camera(tmp_path: Path) -> None:
     lines = [line.strip() for line in KALIBR.splitlines()[2:]]
     text = "sensor_type: camera\n" + "\n".join(lines).replace("radtan", "radial-tangential")
     text = text.replace("distortion_coeffs", "distortion_coefficients")
-    found = read_camera(write(tmp_path / "sensor.yaml", text))
+    found = read_camera(write_text(tmp_path / "sensor.yaml", text))
     assert found == Camera(320, 240, 210.0, 211.0, 160.5, 119.5, D[:4])
 
 
@@ -92,17 +92,17 @@ def test_files_that_opencv_writes(suffix: str, coefficients: int, tmp_path: Path
     assert read_camera(path) == Camera(320, 240, 210.0, 211.0, 160.5, 119.5, tuple(d[:5]))
 
 
-def test_a_number_with_an_underscore_is_none(tmp_path: Path) -> None:
+def test_number_with_an_underscore_is_refused(tmp_path: Path) -> None:
     matrix = "<camera_matrix><data>1_0 0 2 0 10 2 0 0 1</data></camera_matrix>"
     size = "<image_width>4</image_width><image_height>4</image_height>"
     text = f"<opencv_storage>{size}{matrix}</opencv_storage>"
-    assert read_camera(write(tmp_path / "a.xml", text.replace("1_0", "10"))).fx_px == 10
+    assert read_camera(write_text(tmp_path / "a.xml", text.replace("1_0", "10"))).fx_px == 10
     with pytest.raises(SourceError, match=r"camera\.xml"):
-        read_camera(write(tmp_path / "camera.xml", text))
+        read_camera(write_text(tmp_path / "camera.xml", text))
 
 
-def test_a_pixel_of_opencv_s_projection_is_half_a_pixel_from_ours(tmp_path: Path) -> None:
-    found = read_camera(write(tmp_path / "camera.yaml", ROS))
+def test_projection_differs_from_opencv_by_half_a_pixel(tmp_path: Path) -> None:
+    found = read_camera(write_text(tmp_path / "camera.yaml", ROS))
     point = np.array([[0.3, -0.2, 1.0]])
     (pixel,), _ = cv2.projectPoints(point, np.zeros(3), np.zeros(3), K, np.array(D))
     bent, _ = distort(point[:, :2], found.distortion)
@@ -133,7 +133,7 @@ def test_a_pixel_of_opencv_s_projection_is_half_a_pixel_from_ours(tmp_path: Path
 )
 def test_unsupported_calibration_gives_one_line_error(text: str, why: str, tmp_path: Path) -> None:
     with pytest.raises(SourceError, match=why) as e:
-        read_camera(write(tmp_path / "camera.yaml", text))
+        read_camera(write_text(tmp_path / "camera.yaml", text))
     assert "\n" not in str(e.value) and "dmrl calibrate, or write the camera as TOML" in str(
         e.value
     )
@@ -142,7 +142,7 @@ def test_unsupported_calibration_gives_one_line_error(text: str, why: str, tmp_p
 def test_other_json_gives_one_line_error(tmp_path: Path) -> None:
     for document in ({"a": 1}, [1, 2], {"K": 3}):
         with pytest.raises(SourceError, match="is no calibration of ROS, Kalibr or OpenCV"):
-            read_camera(write(tmp_path / "camera.json", json.dumps(document)))
+            read_camera(write_text(tmp_path / "camera.json", json.dumps(document)))
 
 
 def test_third_party_calibration_file_is_read(data: Path) -> None:
@@ -154,12 +154,12 @@ def test_a_file_without_known_coefficients_says_so(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     given = {"image_width": 320, "image_height": 240, "camera_matrix": K.tolist()}
-    path = write(tmp_path / "a.json", json.dumps({**given, "my_lens": [D]}))
+    path = write_text(tmp_path / "a.json", json.dumps({**given, "my_lens": [D]}))
     assert read_camera(path).distortion == ()
     assert "no distortion coefficients found" in capsys.readouterr().err
-    path = write(tmp_path / "b.json", json.dumps({**given, "dist_coeff": [D]}))
+    path = write_text(tmp_path / "b.json", json.dumps({**given, "dist_coeff": [D]}))
     assert read_camera(path) == WANTED
-    read_camera(write(tmp_path / "c.yaml", KALIBR.replace("radtan", "none")))
+    read_camera(write_text(tmp_path / "c.yaml", KALIBR.replace("radtan", "none")))
     assert "no distortion coefficients" not in capsys.readouterr().err
 
 
@@ -170,10 +170,12 @@ def test_four_coefficients_without_a_model_are_named_as_plumb_bob(
     more: dict[str, object], said: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     given = {"image_width": 320, "image_height": 240, "K": K.tolist(), "D": D[:4]}
-    path = write(tmp_path / "a.json", json.dumps({**given, **more}))
+    path = write_text(tmp_path / "a.json", json.dumps({**given, **more}))
     assert read_camera(path).distortion[:4] == D[:4]
     assert ("read as k1, k2, p1, p2 of plumb bob" in capsys.readouterr().err) == said
-    path.write_text(json.dumps({**given, "distortion_model": "fisheye"}))  # as the line says
+    path.write_text(
+        json.dumps({**given, "distortion_model": "fisheye"})
+    )  # the advice of the warning
     with pytest.raises(SourceError, match="its lens model is fisheye"):
         read_camera(path)
 
@@ -181,14 +183,14 @@ def test_four_coefficients_without_a_model_are_named_as_plumb_bob(
 def test_a_message_is_of_the_region_and_the_binning_of_its_images(tmp_path: Path) -> None:
     roi = "{x_offset: 100, y_offset: 40, height: 180, width: 200, do_rectify: true}"
     told = f"{MESSAGE}binning_x: 2\nbinning_y: 3\nroi: {roi}\n"
-    found = read_camera(write(tmp_path / "camera.yaml", told))
+    found = read_camera(write_text(tmp_path / "camera.yaml", told))
     assert found == Camera(100, 60, 105.0, 211 / 3, 30.25, 26.5, D)
     none = "{x_offset: 0, y_offset: 0, height: 0, width: 0, do_rectify: false}"
     whole = f"{MESSAGE}binning_x: 0\nbinning_y: 0\nroi: {none}\n"
-    assert read_camera(write(tmp_path / "whole.yaml", whole)) == WANTED
+    assert read_camera(write_text(tmp_path / "whole.yaml", whole)) == WANTED
 
 
 def test_a_file_without_a_size_names_the_key(tmp_path: Path) -> None:
-    path = write(tmp_path / "a.json", json.dumps({"camera_matrix": K.tolist()}))
+    path = write_text(tmp_path / "a.json", json.dumps({"camera_matrix": K.tolist()}))
     with pytest.raises(SourceError, match="it has no image_width"):
         read_camera(path)

@@ -1,4 +1,4 @@
-"""Signs, projection and grid labels against drawings and the paper."""
+"""Signs, projection and grid labels, compared with hand-drawn cases, OpenCV and the paper."""
 
 import doctest
 from dataclasses import replace
@@ -27,8 +27,10 @@ K = np.array([[184.0, 0.0, 160.0], [0.0, 184.0, 112.0], [0.0, 0.0, 1.0]])
 ANGLE = st.floats(-1.5, 1.5)
 
 
-def pixel(xyz_horizontal: tuple[float, float, float], roll_deg: float, pitch_deg: float) -> Array:
-    """Pixel of a point seen by a robot with this attitude."""
+def project_point(
+    xyz_horizontal: tuple[float, float, float], roll_deg: float, pitch_deg: float
+) -> Array:
+    """Return the pixel (u, v) of a point, metres, seen by a robot with this attitude."""
     turn = camera_from_horizontal(np.radians(roll_deg), np.radians(pitch_deg))
     uv, _ = project(np.array([xyz_horizontal]) @ turn.T, K)
     return uv[0]
@@ -54,24 +56,24 @@ def test_left_of_the_robot_is_left_in_the_image_and_above_is_above() -> None:
     np.testing.assert_allclose(depth_m, [2.0, 2.0])
 
 
-# Drawn by hand for 30 degrees: sin = 0.5, cos = 0.8660. One metre ahead, camera level.
+# Computed by hand for 30 degrees: sin = 0.5, cos = 0.8660. The point is one metre ahead.
 def test_rolling_right_side_down_turns_the_scene_anticlockwise() -> None:
     """With the right side down, the camera's left axis points up.
 
     A peer on the left, level with the robot, lies below that axis: in the lower left.
     """
-    u_px, v_px = pixel((1.0, 0.5, 0.0), 30, 0)
+    u_px, v_px = project_point((1.0, 0.5, 0.0), 30, 0)
     assert u_px == pytest.approx(160 - 184 * 0.5 * 0.8660254)
     assert v_px == pytest.approx(112 + 184 * 0.5 * 0.5)
 
 
 def test_rolling_leaves_the_point_ahead_where_it_was() -> None:
-    np.testing.assert_allclose(pixel((1.0, 0.0, 0.0), 30, 0), [160, 112], atol=1e-12)
+    np.testing.assert_allclose(project_point((1.0, 0.0, 0.0), 30, 0), [160, 112], atol=1e-12)
 
 
 def test_a_nose_down_pitch_lifts_the_horizon() -> None:
     """The camera looks down at the floor, so what is level with it moves up the image."""
-    u_px, v_px = pixel((1.0, 0.0, 0.0), 0, 10)
+    u_px, v_px = project_point((1.0, 0.0, 0.0), 0, 10)
     assert u_px == pytest.approx(160)
     assert v_px == pytest.approx(112 - 184 * np.tan(np.radians(10)))
 
@@ -79,7 +81,7 @@ def test_a_nose_down_pitch_lifts_the_horizon() -> None:
 def test_axis_of_a_camera_pitched_10_degrees_hits_the_floor_ahead() -> None:
     height_m = 1.0
     ahead_m = height_m / np.tan(np.radians(10))
-    np.testing.assert_allclose(pixel((ahead_m, 0.0, -height_m), 0, 10), [160, 112])
+    np.testing.assert_allclose(project_point((ahead_m, 0.0, -height_m), 0, 10), [160, 112])
 
 
 def test_pitch_is_applied_before_roll() -> None:
@@ -106,7 +108,9 @@ def test_printed_signs_of_the_paper_cause_large_pixel_errors(
     tilt_deg: float, error_px: float
 ) -> None:
     point = (1.0, 0.0, 0.0)
-    wrong_px = np.asarray(pixel(point, 0, -tilt_deg)) - np.asarray(pixel(point, 0, tilt_deg))
+    wrong_px = np.asarray(project_point(point, 0, -tilt_deg)) - np.asarray(
+        project_point(point, 0, tilt_deg)
+    )
     assert np.linalg.norm(wrong_px) == pytest.approx(error_px, rel=0.03)
 
 
@@ -182,7 +186,7 @@ def test_projection_with_distortion_equals_opencv() -> None:
     xyz = rng.uniform([1.0, -0.8, -0.6], [4.0, 0.8, 0.6], (200, 3))
     uv, depth_m, _ = pixels_from_horizontal(xyz, roll, pitch, camera)
     for k in range(200):
-        # OpenCV gets the attitude as a product of single turns, written down by hand.
+        # The attitude for OpenCV is a product of rotations about single axes.
         ry = cv2.Rodrigues(np.array([0.0, pitch[k], 0.0]))[0]
         rx = cv2.Rodrigues(np.array([roll[k], 0.0, 0.0]))[0]
         turn = frames.OPTICAL_FROM_CAMERA @ (ry @ rx).T

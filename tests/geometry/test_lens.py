@@ -1,4 +1,4 @@
-"""The plumb-bob model."""
+"""The plumb-bob lens model: distortion, its inverse and derivatives, and where it folds."""
 
 import cv2
 import numpy as np
@@ -42,7 +42,7 @@ def test_distortion_derivatives_equal_finite_differences() -> None:
 
 @pytest.mark.parametrize("k1", [-0.3, -0.5])
 def test_the_lens_folds_back_where_its_slope_ends(k1: float) -> None:
-    fold = np.sqrt(-1 / (3 * k1))  # of r + k1 r^3
+    fold = np.sqrt(-1 / (3 * k1))  # where the derivative of r + k1 r^3 is zero
     inner, outer = distort(np.array([[0.999 * fold, 0.0], [0.0, 1.001 * fold]]), (k1,))[0]
     assert np.isfinite(inner).all()
     assert np.isnan(outer).any()

@@ -1,4 +1,4 @@
-"""Angles and quaternions of a turned body, against rotations that are multiplied out."""
+"""Euler angles and quaternions, compared with products of rotation matrices."""
 
 import numpy as np
 import pytest
@@ -13,8 +13,8 @@ TURN = st.floats(-3.1, 3.1)
 HALF = np.sqrt(0.5)
 
 
-def about(axis: int, angle: float) -> Array:
-    """(3, 3) right-handed turn about x, y or z."""
+def rotation_matrix(axis: int, angle: float) -> Array:
+    """Return the (3, 3) right-handed rotation by an angle, rad, about axis 0, 1 or 2."""
     c, s = np.cos(angle), np.sin(angle)
     first, second = (axis + 1) % 3, (axis + 2) % 3
     out = np.eye(3)
@@ -23,8 +23,8 @@ def about(axis: int, angle: float) -> Array:
     return out
 
 
-def rotation(quaternion: Array) -> Array:
-    """(3, 3) world from body of x, y, z, w: v + 2 w (q x v) + 2 q x (q x v)."""
+def matrix_from_quaternion(quaternion: Array) -> Array:
+    """Return (3, 3) world from body of a quaternion x, y, z, w: v + 2 w (q x v) + 2 q x (q x v)."""
     x, y, z, w = quaternion
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     return np.asarray(np.eye(3) + 2 * w * cross + 2 * cross @ cross)
@@ -34,8 +34,8 @@ def rotation(quaternion: Array) -> Array:
 def test_roll_is_first_then_pitch_then_yaw(roll: float, pitch: float, yaw: float) -> None:
     (quaternion,) = euler_to_quaternion(np.array([[roll, pitch, yaw]]))
     assert np.linalg.norm(quaternion) == pytest.approx(1)
-    wanted = about(2, yaw) @ about(1, pitch) @ about(0, roll)
-    np.testing.assert_allclose(rotation(quaternion), wanted, atol=1e-9)
+    wanted = rotation_matrix(2, yaw) @ rotation_matrix(1, pitch) @ rotation_matrix(0, roll)
+    np.testing.assert_allclose(matrix_from_quaternion(quaternion), wanted, atol=1e-9)
 
 
 @given(TURN, TILT, TURN, st.sampled_from([1.0, -1.0]))

@@ -1,7 +1,7 @@
-"""Small files that ask for much: each ends with one line, in little memory.
+"""Small files that would take excessive memory or time are refused in one line.
 
-Each row is a command on a file of a few kB. Its peak memory is compared with that of the command
-on a sound file, which loads the same packages.
+Each row is a command on a file of a few kB. Its peak memory is compared with that of the same
+command on a valid file, which loads the same packages.
 """
 
 import bz2
@@ -32,11 +32,11 @@ SPARE_KB, FILE_TIMES, WAIT_S = 600_000, 10, 120
 HUGE = 1 << 40
 Make = Callable[[Inputs, Path], None]
 Content = Callable[[], bytes]
-"""Makes what a test needs when it runs: every run of pytest imports this file."""
+"""Returns the content of a file. Called in the test only, to keep the import of this file fast."""
 
 
-def png(width: int, height: int, bits: int = 8) -> bytes:
-    """A black picture of one colour, which compresses a thousandfold."""
+def draw_black_png(width: int, height: int, bits: int = 8) -> bytes:
+    """Draw a black RGB image as PNG, which compresses a thousandfold; ``bits`` per channel."""
 
     def build_png_chunk(kind: bytes, data: bytes) -> bytes:
         return (
@@ -50,8 +50,8 @@ def png(width: int, height: int, bits: int = 8) -> bytes:
     return b"\x89PNG\r\n\x1a\n" + b"".join(build_png_chunk(*chunk) for chunk in chunks)
 
 
-def with_image(content: Content, count: int = 1) -> Make:
-    """A recording of one image, again and again."""
+def make_recording_of(content: Content, count: int = 1) -> Make:
+    """Return a function that writes a recording of one image, ``count`` times."""
 
     def make(_: Inputs, path: Path) -> None:
         data = content()
@@ -63,8 +63,8 @@ def with_image(content: Content, count: int = 1) -> Make:
     return make
 
 
-def picture(content: Content) -> Make:
-    """A folder of one picture."""
+def make_picture_folder(content: Content) -> Make:
+    """Return a function that writes a folder with one image."""
 
     def make(_: Inputs, path: Path) -> None:
         path.mkdir()
@@ -73,14 +73,14 @@ def picture(content: Content) -> Make:
     return make
 
 
-def text(data: str | Content) -> Make:
-    """A file of these characters."""
+def make_text_file(data: str | Content) -> Make:
+    """Return a function that writes a file with this content."""
     content = data.encode if isinstance(data, str) else data
     return lambda _, path: path.write_bytes(content()) and None
 
 
-def chunk_bomb(kind: str) -> Make:
-    """A recording of one chunk that decompresses to gigabytes."""
+def make_chunk_bomb(kind: str) -> Make:
+    """Return a function that writes a recording of one chunk that decompresses to gigabytes."""
 
     def make(_: Inputs, path: Path) -> None:
         data = build_zstd_bomb(6 << 30) if kind == "zstd" else lz4.frame.compress(bytes(1 << 30))
@@ -89,8 +89,8 @@ def chunk_bomb(kind: str) -> Make:
     return make
 
 
-def int8(size: int) -> Make:
-    """An int8 model, whose arrays unpack to a lot."""
+def make_int8_model(size: int) -> Make:
+    """Return a function that writes an int8 model with an array of this many bytes."""
 
     def make(i: Inputs, path: Path) -> None:
         path.mkdir()
@@ -109,8 +109,8 @@ def int8(size: int) -> Make:
     return make
 
 
-def onnx_model(kind: str) -> Make:
-    """An export folder, whose network asks for memory, time or another file."""
+def make_onnx_model(kind: str) -> Make:
+    """Return a function that writes an export whose network takes memory, time or another file."""
 
     def make(i: Inputs, path: Path) -> None:
         onnx = pytest.importorskip("onnx")
@@ -155,8 +155,8 @@ def onnx_model(kind: str) -> Make:
     return make
 
 
-def keras(_: Inputs, path: Path) -> None:
-    """Weights of zeros that unpack to 4 GB."""
+def write_keras_weights(_: Inputs, path: Path) -> None:
+    """Write weights of zeros that decompress to 4 GB."""
     h5py = pytest.importorskip("h5py")
     with h5py.File(path, "w") as file:
         file.attrs["layer_names"] = [b"conv2d"]
@@ -167,8 +167,8 @@ def keras(_: Inputs, path: Path) -> None:
         )
 
 
-def parquet(_: Inputs, path: Path) -> None:
-    """A dataset whose one column decompresses to 2 GB."""
+def write_parquet_dataset(_: Inputs, path: Path) -> None:
+    """Write a dataset with a column that decompresses to 2 GB."""
     pa, pq = pytest.importorskip("pyarrow"), pytest.importorskip("pyarrow.parquet")
     path.mkdir()
     values = pa.array([bytes(10_000_000)] * 200, pa.binary())
@@ -178,39 +178,39 @@ def parquet(_: Inputs, path: Path) -> None:
 
 
 BOMBS: dict[str, tuple[str, str, str, Make]] = {
-    "chunk of zstd": ("one", "check {bomb}", "check {dots}", chunk_bomb("zstd")),
-    "chunk of lz4": ("one", "check {bomb}", "check {dots}", chunk_bomb("lz4")),
+    "chunk of zstd": ("one", "check {bomb}", "check {dots}", make_chunk_bomb("zstd")),
+    "chunk of lz4": ("one", "check {bomb}", "check {dots}", make_chunk_bomb("lz4")),
     "blank 4K images": (
         "any",
         "predict {model} {bomb} {out}.mcap --backend torch",
         "predict {model} {dots} {out}.mcap --backend torch",
-        with_image(partial(png, 3840, 2160), 4),
+        make_recording_of(partial(draw_black_png, 3840, 2160), 4),
     ),
     "image of 13,000 px": (
         "one",
         "predict {model} {bomb} {out}.mcap --backend torch",
         "predict {model} {dots} {out}.mcap --backend torch",
-        with_image(partial(png, 13_000, 13_000)),
+        make_recording_of(partial(draw_black_png, 13_000, 13_000)),
     ),
     "picture of 13,000 px": (
         "one",
         "convert {bomb} {out}.mcap",
         "convert {pictures} {out}.mcap",
-        picture(partial(png, 13_000, 13_000)),
+        make_picture_folder(partial(draw_black_png, 13_000, 13_000)),
     ),
     "picture of 16 bits": (
         "any",
         "convert {bomb} {out}.mcap",
         "convert {pictures} {out}.mcap",
-        picture(partial(png, 7_900, 7_900, 16)),
+        make_picture_folder(partial(draw_black_png, 7_900, 7_900, 16)),
     ),
-    "arrays": ("one", "verify {bomb}", "doctor", int8(4 << 30)),
+    "arrays": ("one", "verify {bomb}", "doctor", make_int8_model(4 << 30)),
     **{
         f"ONNX: {kind}": (
             "one",
             "predict {bomb} {dots} {out}.mcap --backend onnx",
             "predict {c} {dots} {out}.mcap --backend onnx",
-            onnx_model(kind),
+            make_onnx_model(kind),
         )
         for kind in ("memory", "work", "loop", "foreign", "elsewhere", "any size")
     },
@@ -218,34 +218,46 @@ BOMBS: dict[str, tuple[str, str, str, Make]] = {
         "one",
         "predict {bomb} {dots} {out}.mcap",
         "predict {model} {dots} {out}.mcap --backend torch",
-        keras,
+        write_keras_weights,
     ),
-    "Parquet": ("one", "card {bomb}", "info {dots}", parquet),
+    "Parquet": ("one", "card {bomb}", "info {dots}", write_parquet_dataset),
     "recipe of steps": (
         "one",
         "run {bomb} --out {out}",
         "run {chain} --out {out} --dry-run",
-        text('kind = "pipeline"\n[[step]]\neach = 100000000\nstage = "sketch"\nout = "p{each}"\n'),
+        make_text_file(
+            'kind = "pipeline"\n[[step]]\neach = 100000000\nstage = "sketch"\nout = "p{each}"\n'
+        ),
     ),
-    "nested TOML": ("one", "run {bomb} --out {out}", "info {dots}", text("a = " + "[" * 90_000)),
-    "long keys": ("one", "run {bomb} --out {out}", "info {dots}", text("a." * 49_000 + "b = 1")),
+    "nested TOML": (
+        "one",
+        "run {bomb} --out {out}",
+        "info {dots}",
+        make_text_file("a = " + "[" * 90_000),
+    ),
+    "long keys": (
+        "one",
+        "run {bomb} --out {out}",
+        "info {dots}",
+        make_text_file("a." * 49_000 + "b = 1"),
+    ),
     "numbers": (
         "one",
         "convert {bomb} {out}.mcap",
         "info {dots}",
-        text(lambda: b"t_s," + b"1," * 5_000_000),
+        make_text_file(lambda: b"t_s," + b"1," * 5_000_000),
     ),
     "query": (
         "one",
         "find list_sum(range(1000000000))>messages {indexed}",
         "find true {indexed}",
-        text(""),
+        make_text_file(""),
     ),
     "bag of bz2": (
         "one",
         "convert {bomb} {out}.mcap",
         "info {dots}",
-        text(lambda: b"#ROSBAG V2.0\n" + bz2.compress(bytes(1 << 28))),
+        make_text_file(lambda: b"#ROSBAG V2.0\n" + bz2.compress(bytes(1 << 28))),
     ),
 }
 SUFFIXES = {"chunk": ".mcap", "blank": ".mcap", "image": ".mcap", "HDF5": ".h5", "bag": ".bag"}
@@ -274,9 +286,11 @@ def run(words: str, places: dict[str, object], log: Path) -> tuple[int, str, int
     return process.returncode, log.read_text(), used.ru_maxrss
 
 
-OVER = {"picture of 16 bits": "a photo of 62 million pixels takes 765 MB"}
+KNOWN_FAILURES = {"picture of 16 bits": "a photo of 62 million pixels takes 765 MB"}
 ROWS = [
-    pytest.param(name, marks=pytest.mark.xfail(reason=OVER[name]) if name in OVER else ())
+    pytest.param(
+        name, marks=pytest.mark.xfail(reason=KNOWN_FAILURES[name]) if name in KNOWN_FAILURES else ()
+    )
     for name in BOMBS
 ]
 

@@ -1,4 +1,4 @@
-"""Untrusted documents: excessive demands are a ValueError before they are met."""
+"""Untrusted documents and arrays that would take excessive memory raise a ValueError first."""
 
 import io
 import zipfile
@@ -28,7 +28,7 @@ def test_deepest_allowed_nesting_is_read() -> None:
 
 @pytest.mark.parametrize("number", [2**64, -(2**64), 10**400])
 def test_whole_numbers_have_64_bits(number: int) -> None:
-    """`float` and NumPy fail on larger ones, in their own ways."""
+    """`float` and NumPy would raise other exceptions for larger integers."""
     for text in (f"[{number}]", f'{{"a": {{"b": [1, {number}]}}}}'):
         with pytest.raises(ValueError, match="an integer of"):
             parse_json(text)
@@ -86,7 +86,7 @@ def test_a_damaged_archive_of_any_compression_is_refused(kind: int, tmp_path: Pa
 
 
 def test_archive_member_is_read_up_to_its_stated_size(tmp_path: Path) -> None:
-    """The list of an archive may say less than its members hold: no more than that is read."""
+    """The directory of an archive may state a smaller size than its member has."""
     path = tmp_path / "a.npz"
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("a.npy", bytes(10 << 20))

@@ -1,4 +1,4 @@
-"""Queries in a sandboxed process: every failure ends in one line."""
+"""Queries in a sandboxed process: every failure gives a one-line error."""
 
 import os
 import socket
@@ -29,7 +29,8 @@ def abort(_: bytes) -> bytes:
     os.abort()
 
 
-def call(_: bytes) -> bytes:
+def connect_to_localhost(_: bytes) -> bytes:
+    """Try to connect to a local port and return the error number."""
     with socket.socket() as stream:
         stream.settimeout(5)
         return str(stream.connect_ex(("127.0.0.1", 9))).encode()
@@ -41,7 +42,8 @@ def spin(_: bytes) -> bytes:
 
 
 @pytest.fixture(autouse=True)
-def importable(monkeypatch: pytest.MonkeyPatch) -> None:
+def importable_module(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the sandboxed process import this module."""
     before = os.environ.get("PYTHONPATH", "")
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(Path(__file__).parent), before]))
 
@@ -83,5 +85,5 @@ def test_cpu_time_is_limited(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="a system may forbid users namespaces")
 def test_the_child_has_no_network() -> None:
-    """Without interfaces even the own address is out of reach: ENETUNREACH, not ECONNREFUSED."""
-    assert int(run("call")) == 101
+    """Without network interfaces even localhost is unreachable: ENETUNREACH, not ECONNREFUSED."""
+    assert int(run("connect_to_localhost")) == 101

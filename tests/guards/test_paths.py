@@ -40,6 +40,7 @@ OPENED: dict[str, Callable[[Path], object]] = {
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
+    """Return a folder with a file and a subfolder."""
     (tmp_path / "given" / "deep").mkdir(parents=True)
     (tmp_path / "given" / "a.txt").write_text("a")
     return tmp_path / "given"
@@ -83,7 +84,7 @@ def test_pipe_check_ignores_files_missing_paths_and_buckets(folder: Path) -> Non
 def test_pipe_device_or_socket_is_refused(
     reads: Callable[[str], object], kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.chdir(tmp_path)  # the name of a socket is short
+    monkeypatch.chdir(tmp_path)  # socket names have a length limit
     if kind == "pipe":
         os.mkfifo("a.toml")
     elif kind == "device":
@@ -96,8 +97,8 @@ def test_pipe_device_or_socket_is_refused(
 
 
 @pytest.mark.heavy
-def test_every_path_of_a_command_line_is_refused_so() -> None:
-    """Those that may be left out too, of which the command line's library says what it likes."""
+def test_every_path_argument_refuses_pipes_and_devices() -> None:
+    """Optional path arguments do so too."""
     of_paths = [
         (name, one.hint)
         for name in cli.COMMANDS

@@ -1,4 +1,4 @@
-"""Names from files never become a path elsewhere, an end of a comment, or markup."""
+"""Names from untrusted files: they leave no folder, end no comment, and become no markup."""
 
 from pathlib import Path
 
@@ -85,6 +85,6 @@ def test_markup_in_names_is_escaped() -> None:
 
 
 def test_errors_are_one_line_whatever_they_quote() -> None:
-    """A library's words of a damaged schema held a line end, and so did the error from Python."""
+    """Error texts of libraries may contain line ends, for example about a damaged schema."""
     error = RecordingError("a.mcap is damaged (invalid name (\nheight\x1b[2J)). Try: dmrl recover")
     assert str(error) == r"a.mcap is damaged (invalid name ( height\x1b[2J)). Try: dmrl recover"

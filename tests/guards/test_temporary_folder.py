@@ -1,4 +1,4 @@
-"""A command's temporary folder: its own, and removed also after kill -9."""
+"""Each command has its own temporary folder, which is removed even after kill -9."""
 
 import os
 import signal
@@ -10,7 +10,7 @@ import pytest
 
 from dmrl.guards.temporary_folder import PREFIX
 
-LITTER = """
+MAKE_FILES = """
 import os, sys, tempfile, time
 from pathlib import Path
 from dmrl.guards.temporary_folder import use_own_temporary_folder
@@ -18,8 +18,8 @@ use_own_temporary_folder()
 tempfile.mkdtemp(prefix="torchinductor_")
 os.system("mktemp -d -t blender_XXXXXX > /dev/null")
 """
-KILLED = LITTER + "os.kill(os.getpid(), 9)"
-WAITS = LITTER + "print(os.environ['TMPDIR'], flush=True); input()"
+MAKE_FILES_AND_DIE = MAKE_FILES + "os.kill(os.getpid(), 9)"
+MAKE_FILES_AND_WAIT = MAKE_FILES + "print(os.environ['TMPDIR'], flush=True); input()"
 
 
 def run(code: str, system: Path) -> int:
@@ -31,13 +31,13 @@ def run(code: str, system: Path) -> int:
 
 
 def test_temporary_files_are_removed_when_the_command_ends(tmp_path: Path) -> None:
-    assert run(LITTER, tmp_path) == 0
+    assert run(MAKE_FILES, tmp_path) == 0
     assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.heavy
 def test_temporary_folder_of_a_killed_command_is_removed_at_next_start(tmp_path: Path) -> None:
-    assert run(KILLED, tmp_path) == -signal.SIGKILL
+    assert run(MAKE_FILES_AND_DIE, tmp_path) == -signal.SIGKILL
     (left,) = tmp_path.iterdir()
     assert len(list(left.iterdir())) == 2
     command = "import sys; sys.argv = ['dmrl', '--version']; from dmrl.cli import main; main()"
@@ -49,7 +49,7 @@ def test_temporary_folder_of_a_killed_command_is_removed_at_next_start(tmp_path:
 def test_temporary_folder_of_a_running_command_is_kept(tmp_path: Path) -> None:
     environment = os.environ | {"TMPDIR": str(tmp_path)}
     with subprocess.Popen(
-        [sys.executable, "-c", WAITS],
+        [sys.executable, "-c", MAKE_FILES_AND_WAIT],
         env=environment,
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
@@ -57,7 +57,7 @@ def test_temporary_folder_of_a_running_command_is_kept(tmp_path: Path) -> None:
     ) as other:
         assert other.stdout and other.stdin
         folder = Path(other.stdout.readline().strip())
-        assert run(LITTER, tmp_path) == 0
+        assert run(MAKE_FILES, tmp_path) == 0
         assert list(tmp_path.iterdir()) == [folder] and len(list(folder.iterdir())) == 2
         other.stdin.write("\n")
     assert other.returncode == 0 and list(tmp_path.iterdir()) == []
@@ -77,12 +77,12 @@ def test_foreign_files_in_the_temporary_folder_are_kept(what: str, tmp_path: Pat
     else:
         place.mkdir(mode=0o777)
         place.chmod(0o777)
-    assert run(LITTER, system) == 0
+    assert run(MAKE_FILES, system) == 0
     assert list(system.iterdir()) == [place] and (victim / "data").read_text() == "kept"
 
 
 def test_unwritable_temporary_folder_leaves_tempdir_unchanged(tmp_path: Path) -> None:
-    code = LITTER.split("tempfile.mkdtemp")[0].replace(
+    code = MAKE_FILES.split("tempfile.mkdtemp")[0].replace(
         "\nuse_own", "\ntempfile.tempdir = '/nowhere'\nuse_own"
     )
     check = "assert (tempfile.tempdir, os.environ['TMPDIR']) == ('/nowhere', sys.argv[-1])"

@@ -1,3 +1,5 @@
+"""Encoding and decoding of images: damaged, oversized and unusual files."""
+
 import struct
 import zlib
 from io import BytesIO
@@ -24,7 +26,7 @@ def test_png_keeps_every_pixel(rgb: codec.Rgb) -> None:
     assert codec.encode_png(rgb) == png
 
 
-def test_jpeg_is_near(rgb: codec.Rgb) -> None:
+def test_jpeg_is_close_to_the_original(rgb: codec.Rgb) -> None:
     smooth = np.broadcast_to(np.arange(24, dtype=np.uint8)[:, None, None] * 8, (24, 32, 3)).copy()
     jpeg = codec.encode_jpeg(smooth)
     assert codec.read_size(jpeg) == (32, 24, "jpeg")
@@ -63,13 +65,13 @@ def test_a_picture_of_indexed_colours_without_their_palette_is_named(rgb: codec.
     stream = BytesIO()
     Image.fromarray(rgb).convert("P").save(stream, "PNG")
     assert codec.decode(stream.getvalue()).shape == rgb.shape
-    without = stream.getvalue().replace(b"PLTE", b"pLTE")  # a chunk that may be skipped
+    without = stream.getvalue().replace(b"PLTE", b"pLTE")  # an optional chunk, which is skipped
     with pytest.raises(SourceError, match=r"a\.png cannot be decoded: its palette is missing"):
-        codec.decode(_with_sums(without), "a.png")
+        codec.decode(correct_crcs(without), "a.png")
 
 
-def _with_sums(png: bytes) -> bytes:
-    """A PNG whose chunks have their check sums."""
+def correct_crcs(png: bytes) -> bytes:
+    """Return a PNG with the CRC of every chunk corrected."""
     out, at = png[:8], 8
     while at < len(png):
         (size,) = struct.unpack_from(">I", png, at)
@@ -83,13 +85,13 @@ def test_the_part_that_is_scaled_is_the_one_named() -> None:
     rgb = np.zeros((40, 60, 3), np.uint8)
     rgb[10:30, 20:40] = 200
     part = codec.crop_and_scale(rgb, (20, 10, 40, 30), 10, 10)
-    assert part.min() > 150  # the border mixes with its neighbours
+    assert part.min() > 150  # scaling mixes the border with its neighbours
     assert np.abs(part[1:-1, 1:-1].astype(int) - 200).max() < 6
     assert codec.crop_and_scale(rgb, (0, 0, 60, 40), 30, 20).shape == (20, 30, 3)
 
 
-def _png_of(width_px: int, height_px: int) -> bytes:
-    """A grey PNG of zeros, made without its pixels."""
+def build_png(width_px: int, height_px: int) -> bytes:
+    """Build a black grey-scale PNG without holding its pixels in memory."""
     packer = zlib.compressobj(9)
     row = bytes(1 + width_px)
     body = b"".join(packer.compress(row) for _ in range(height_px)) + packer.flush()
@@ -108,7 +110,7 @@ def _png_of(width_px: int, height_px: int) -> bytes:
 def test_a_picture_of_too_many_pixels_is_refused_before_it_is_decoded(
     side_px: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    header = _png_of(side_px, 1)
+    header = build_png(side_px, 1)
     header = header[:16] + struct.pack(">II", side_px, side_px) + header[24:]
     header = header[:29] + struct.pack(">I", zlib.crc32(header[12:29])) + header[33:]
     monkeypatch.setattr(Image.Image, "load", None)
@@ -124,12 +126,12 @@ def test_a_picture_of_too_many_pixels_is_refused_before_it_is_decoded(
 
 @pytest.mark.heavy
 def test_an_image_of_a_recording_is_no_larger_than_a_network_can_take() -> None:
-    """A blank one of 190 kB took `dmrl predict` 6.5 GB."""
-    large = _png_of(3840, 2352)
+    """Without the limit, a blank image of 190 kB would take `dmrl predict` 6.5 GB."""
+    large = build_png(3840, 2352)
     with pytest.raises(SourceError, match=r"a\.png has more than 9 million pixels.* Scale it down"):
         codec.decode(large, "a.png")
     assert codec.decode(large, "a.png", limits.PIXELS).shape == (2352, 3840, 3)
-    assert codec.decode(_png_of(3840, 2160)).shape == (2160, 3840, 3)
+    assert codec.decode(build_png(3840, 2160)).shape == (2160, 3840, 3)
 
 
 @pytest.mark.heavy
@@ -148,7 +150,7 @@ def test_a_jpeg_of_endless_scans_is_refused() -> None:
 
 @pytest.mark.heavy
 def test_a_large_photo_is_no_bomb() -> None:
-    assert codec.decode(_png_of(6000, 4000), most=limits.PIXELS).shape == (4000, 6000, 3)
+    assert codec.decode(build_png(6000, 4000), most=limits.PIXELS).shape == (4000, 6000, 3)
 
 
 def test_a_ppm_whose_header_does_not_end_is_refused() -> None:
@@ -161,14 +163,14 @@ def test_a_ppm_whose_header_does_not_end_is_refused() -> None:
 
 
 @pytest.mark.parametrize("shape", [(65_536, 1), (1, 65_536)])
-def test_a_picture_has_sides_of_a_jpeg_at_most(shape: tuple[int, int]) -> None:
-    """A column of sixty million pixels, 61 kB, took 1.8 GB."""
+def test_image_with_longer_sides_than_a_jpeg_may_have_is_refused(shape: tuple[int, int]) -> None:
+    """Without the limit, a column of 60 million pixels, 61 kB, would take 1.8 GB."""
     with pytest.raises(SourceError, match=r"a\.png is 65536 px long"):
         codec.decode(codec.encode_png(np.zeros(shape, np.uint8)), "a.png")
 
 
 def test_large_blank_pictures_have_a_budget_together(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A folder of them takes a second for each 7 kB."""
+    """Without the budget, a folder of them would take a second of CPU time per 7 kB."""
     monkeypatch.setattr(codec, "_spent", 0)
     monkeypatch.setattr(codec.limits, "DECODED_PIXELS", 4_000_000)
     blank = codec.encode_png(np.zeros((1600, 2000), np.uint8))

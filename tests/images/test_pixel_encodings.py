@@ -1,4 +1,4 @@
-"""Every encoding of ROS's image_encodings.hpp, against OpenCV or against the definition."""
+"""Every pixel encoding of ROS's image_encodings.hpp, compared with OpenCV or its definition."""
 
 import re
 
@@ -19,8 +19,8 @@ ROS = [
 """All names of the header with channels of 8 or 16 bits."""
 
 
-def raw(rows: int, values: int, size: int, spare: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """Random values (rows, values), and their bytes with spare ones after each row."""
+def draw_raw(rows: int, values: int, size: int, spare: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Draw random values (rows, values); return them and their bytes, with spare ones per row."""
     rng = np.random.default_rng(values)
     found = rng.integers(0, 256**size, (rows, values)).astype(f"<u{size}")
     lines = np.concatenate([found.view(np.uint8), np.full((rows, spare), 9, np.uint8)], axis=1)
@@ -39,7 +39,7 @@ def test_channel_order_follows_the_encoding_name(encoding: str, big: bool, spare
     assert found is not None
     name, size = found[1], int(found[2] or found[3]) // 8
     count = int(found[5] or {"mono": 1}.get(name, len(name)))
-    values, data = raw(HEIGHT, WIDTH * count, size, spare)
+    values, data = draw_raw(HEIGHT, WIDTH * count, size, spare)
     if big and size == 2:
         data = values.byteswap().view(np.uint8)
         data = np.pad(data, ((0, 0), (0, spare))).ravel()
@@ -49,7 +49,7 @@ def test_channel_order_follows_the_encoding_name(encoding: str, big: bool, spare
     pixels = values.reshape(HEIGHT, WIDTH, count).astype(np.float64)
     if found[4] == "S":
         pixels = (pixels + 256**size / 2) % 256**size
-    letters = name if name in ("rgb", "bgr", "rgba", "bgra") else "bgra"  # OpenCV's
+    letters = name if name in ("rgb", "bgr", "rgba", "bgra") else "bgra"  # the order of OpenCV
     places = [letters.index(c) if count > 2 else 0 for c in "rgb"]
     want = pixels[..., places] * 255 / (256**size - 1)
     assert np.abs(rgb - want).max() <= 0.5 + 1e-9
@@ -57,8 +57,8 @@ def test_channel_order_follows_the_encoding_name(encoding: str, big: bool, spare
 
 @pytest.mark.parametrize("pattern", ["rggb", "bggr", "gbrg", "grbg"])
 @pytest.mark.parametrize("bits", [8, 16])
-def test_a_colour_sensor_s_picture_gets_its_colours(pattern: str, bits: int) -> None:
-    # A scene of one colour: each pixel of the mosaic is the value of its filter.
+def test_bayer_pattern_of_one_colour_gives_that_colour(pattern: str, bits: int) -> None:
+    # In a scene of one colour, each pixel of the mosaic has the value of its colour filter.
     colour = dict(zip("rgb", (200, 90, 30), strict=True))
     mosaic = np.array([[colour[pattern[2 * (v % 2) + u % 2]] for u in range(8)] for v in range(6)])
     kind = np.uint8 if bits == 8 else np.dtype("<u2")
@@ -81,7 +81,7 @@ def test_a_colour_sensor_s_picture_gets_its_colours(pattern: str, bits: int) -> 
 )
 def test_luma_and_chroma_conversion_equals_opencv(encoding: str, rows: int, code: int) -> None:
     count = 1 if encoding.startswith("nv") else 2
-    values, data = raw(rows, WIDTH * count, 1)
+    values, data = draw_raw(rows, WIDTH * count, 1)
     values = values.clip(16, 235)
     want = cv2.cvtColor(values if count == 1 else values.reshape(rows, WIDTH, 2), code)
     rgb = convert_to_rgb(values.ravel(), encoding, (HEIGHT, WIDTH), WIDTH * count)
@@ -91,7 +91,7 @@ def test_luma_and_chroma_conversion_equals_opencv(encoding: str, rows: int, code
 
 def test_nv24_has_a_chroma_sample_for_each_pixel() -> None:
     y = np.full((HEIGHT, WIDTH), 81, np.uint8)
-    chroma = np.tile(np.array([90, 240], np.uint8), HEIGHT * WIDTH)  # U, V of pure red
+    chroma = np.tile(np.array([90, 240], np.uint8), HEIGHT * WIDTH)  # U and V of red
     data = np.concatenate([y.ravel(), chroma])
     rgb = convert_to_rgb(data, "nv24", (HEIGHT, WIDTH), WIDTH)
     assert np.abs(rgb.astype(int) - (254, 0, 0)).max() <= 2

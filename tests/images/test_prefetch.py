@@ -1,4 +1,4 @@
-"""Work done ahead in threads: order, errors in their turn, bounded."""
+"""Work done ahead in threads: ordered results, errors in turn, a bounded number of items."""
 
 import pytest
 
@@ -17,7 +17,7 @@ def test_an_error_comes_when_it_is_its_turn() -> None:
         next(results)
 
 
-def test_no_more_is_taken_than_may_wait() -> None:
+def test_number_of_items_taken_ahead_is_bounded() -> None:
     taken: list[int] = []
     results = map_ahead(lambda k: k, (taken.append(k) or k for k in range(100)), 2, max_waiting=3)
     assert next(results) == 0

@@ -1,4 +1,4 @@
-"""MCAP files of Foxglove's own schemas and writers, as recordings of dmrl."""
+"""Conversion of MCAP files with Foxglove's own schemas and writers."""
 
 import base64
 import json
@@ -29,24 +29,25 @@ START_NS = 1_700_000_000_000_000_000
 PIXELS = np.arange(24 * 32 * 3, dtype=np.uint8).reshape(24, 32, 3)
 
 
-def stamped(message: Any, time_ns: int) -> Any:
+def set_timestamp(message: Any, time_ns: int) -> Any:
+    """Set the time stamp of a message and return it."""
     message.timestamp.FromNanoseconds(time_ns)
     return message
 
 
-def foxglove(path: Path, sent: dict[str, Any], count: int = 3) -> Path:
-    """Messages by topic, each received a millisecond after its time."""
+def write_foxglove_file(path: Path, sent: dict[str, Any], count: int = 3) -> Path:
+    """Write a message per topic every 0.1 s, each received 1 ms after its time stamp."""
     with path.open("wb") as stream, Writer(stream) as writer:
         for k in range(count):
             for topic, message in sent.items():
                 time_ns = START_NS + k * 10**8
                 late = time_ns + 10**6
-                writer.write_message(topic, stamped(message, time_ns), late, late)
+                writer.write_message(topic, set_timestamp(message, time_ns), late, late)
     return path
 
 
-def convert(path: Path, out: Path, **settings: Any) -> tuple[Any, dict[str, int]]:
-    """The recording, and what was left out."""
+def convert_and_open(path: Path, out: Path, **settings: Any) -> tuple[Any, dict[str, int]]:
+    """Convert a file; return the recording, and the count of everything left out by reason."""
     with count_left_out() as left:
         run(path, out, Settings(**settings))
     return dmrl.open(out), dict(left.counts)
@@ -59,7 +60,8 @@ CAMERA = CameraCalibration(
 )  # fmt: skip
 
 
-def a_pose(x: float = 1.0, w: float = 1.0) -> PoseInFrame:
+def build_pose(x: float = 1.0, w: float = 1.0) -> PoseInFrame:
+    """Build a pose at x, metres, with this w of its quaternion."""
     made = PoseInFrame()
     made.pose.position.x, made.pose.orientation.w = x, w
     return made
@@ -71,10 +73,12 @@ def test_foxglove_s_messages_become_topics_of_robots(tmp_path: Path) -> None:
         "/camera/image": CompressedImage(data=encode_png(PIXELS), format="png"),
         "/camera/info": CAMERA,
         "/fleet/cf2/front/raw": raw,
-        "/fleet/cf2/pose": a_pose(),
-        "/vicon/cf2/pose": a_pose(2.0),
+        "/fleet/cf2/pose": build_pose(),
+        "/vicon/cf2/pose": build_pose(2.0),
     }
-    found, left = convert(foxglove(tmp_path / "a.mcap", sent), tmp_path / "b.mcap")
+    found, left = convert_and_open(
+        write_foxglove_file(tmp_path / "a.mcap", sent), tmp_path / "b.mcap"
+    )
     assert not left
     assert {topic: info.count for topic, info in found.topics.items()} == {
         "/cf1/camera/image": 3,
@@ -87,7 +91,7 @@ def test_foxglove_s_messages_become_topics_of_robots(tmp_path: Path) -> None:
     assert table["log_time"].to_pylist() == [START_NS + k * 10**8 for k in range(3)]
     assert table["publish_time"][0].as_py() == START_NS + 10**6
     np.testing.assert_array_equal(decode(table["data"][0].as_py()), PIXELS[..., ::-1])
-    # Foxglove counts from the centre of the first pixel, as ROS does.
+    # As in ROS, Foxglove's pixel origin is the centre of the first pixel.
     assert found["/cf1/camera/calibration"].to_arrow()["K"][0].as_py()[2] == 16.0
 
 
@@ -97,10 +101,12 @@ def test_unusable_topics_are_reported(tmp_path: Path) -> None:
         "/a/image": image,
         "/a/video": CompressedImage(data=b"\0\0\0\1\x67", format="h264"),
         "/b/video": CompressedImage(data=b"\0\0\0\1\x67", format="h264"),
-        "/b/pose": a_pose(math.nan),
-        "/c/pose": a_pose(1.0, 0.0),
+        "/b/pose": build_pose(math.nan),
+        "/c/pose": build_pose(1.0, 0.0),
     }
-    found, left = convert(foxglove(tmp_path / "a.mcap", sent), tmp_path / "b.mcap")
+    found, left = convert_and_open(
+        write_foxglove_file(tmp_path / "a.mcap", sent), tmp_path / "b.mcap"
+    )
     assert list(found.topics) == ["/a/camera/image"]
     assert left == {
         "messages on /a/video: another topic has this of a, /a/image": 3,
@@ -121,14 +127,14 @@ def test_messages_and_schemas_that_cannot_be_used_spare_the_others(tmp_path: Pat
             ("/cf1/height", "dmrl.v1.Height", right, height(height_m=2.0).SerializeToString()),
             ("/cf2/height", "dmrl.v1.Height", right, b"\xff\xff\xff"),
             ("/cf1/log/a", "dmrl.log.A", wrong, b""),
-            ("/cf3/pose", "foxglove.PoseInFrame", wrong, a_pose().SerializeToString()),
+            ("/cf3/pose", "foxglove.PoseInFrame", wrong, build_pose().SerializeToString()),
         ):
             channel = writer.register_channel(
                 topic, "protobuf", writer.register_schema(name, "protobuf", schema)
             )
             writer.add_message(channel, 5, data, 5)
         writer.finish()
-    found, left = convert(tmp_path / "a.mcap", tmp_path / "b.mcap")
+    found, left = convert_and_open(tmp_path / "a.mcap", tmp_path / "b.mcap")
     assert list(found.topics) == ["/cf1/height"]
     assert left == {
         f"messages on {topic} that cannot be decoded": 1
@@ -136,8 +142,8 @@ def test_messages_and_schemas_that_cannot_be_used_spare_the_others(tmp_path: Pat
     }
 
 
-def json_file(path: Path, sent: dict[str, tuple[str, list[Any]]]) -> Path:
-    """Schema and messages by topic, JSON."""
+def write_json_file(path: Path, sent: dict[str, tuple[str, list[Any]]]) -> Path:
+    """Write topics of JSON messages, given the schema name and messages of each."""
     with path.open("wb") as stream:
         writer = PlainWriter(stream)
         writer.start()
@@ -162,7 +168,7 @@ def test_foxglove_s_messages_in_json(tmp_path: Path) -> None:
         "pose": {"position": {"x": 1, "y": 2.5, "z": 3},
                  "orientation": {"x": 0, "y": 0, "z": 0, "w": 1}},
     }  # fmt: skip
-    path = json_file(
+    path = write_json_file(
         tmp_path / "a.mcap",
         {
             "/cam": ("foxglove.CompressedImage", [image, image | {"data": "%%"}, b"{", [], {}]),
@@ -170,7 +176,7 @@ def test_foxglove_s_messages_in_json(tmp_path: Path) -> None:
             "/other": ("my.Thing", [{"x": 1}]),
         },
     )
-    found, left = convert(path, tmp_path / "b.mcap", robot="cf4")
+    found, left = convert_and_open(path, tmp_path / "b.mcap", robot="cf4")
     image_table = found["/cf4/camera/image"].to_arrow()
     assert image_table["log_time"].to_pylist() == [1_700_000_001_000_000_005]
     assert image_table["data"].to_pylist() == [encode_png(PIXELS)]
@@ -184,10 +190,13 @@ def test_foxglove_s_messages_in_json(tmp_path: Path) -> None:
 
 
 def test_topics_are_renamed_to_topics_of_dmrl(tmp_path: Path) -> None:
-    sent = {"/rec/x": CompressedImage(data=encode_png(PIXELS), format="png"), "/rec/y": a_pose()}
-    path = foxglove(tmp_path / "a.mcap", sent)
+    sent = {
+        "/rec/x": CompressedImage(data=encode_png(PIXELS), format="png"),
+        "/rec/y": build_pose(),
+    }
+    path = write_foxglove_file(tmp_path / "a.mcap", sent)
     names = "/rec/x=/cf5/camera/image,/rec/y=/cf6/pose/truth"
-    found, _ = convert(path, tmp_path / "b.mcap", names=names)
+    found, _ = convert_and_open(path, tmp_path / "b.mcap", names=names)
     assert set(found.topics) == {"/cf5/camera/image", "/cf6/pose/truth"}
     with pytest.raises(SettingError, match=r"is not converted to /cf5/height"):
         run(path, tmp_path / "c.mcap", Settings(names="/rec/x=/cf5/height"))
@@ -198,15 +207,15 @@ def test_topics_are_renamed_to_topics_of_dmrl(tmp_path: Path) -> None:
 
 def test_missing_topic_error_suggests_renaming(tmp_path: Path) -> None:
     sent = {"/camera/image": CompressedImage(data=encode_png(PIXELS), format="png")}
-    path = foxglove(tmp_path / "a.mcap", sent)
+    path = write_foxglove_file(tmp_path / "a.mcap", sent)
     with pytest.raises(MissingTopic, match="--names /camera/image=/cf1/camera/image"):
         match_topics(path, ["/*/camera/image"])
 
 
 def test_a_copy_that_dmrl_made_of_a_foreign_file_is_converted(tmp_path: Path) -> None:
-    """It has dmrl's provenance, and foreign topics."""
+    """The copy has dmrl's provenance but foreign topics."""
     sent = {"/cf7/camera/picture": CompressedImage(data=encode_png(PIXELS), format="png")}
-    recover(foxglove(tmp_path / "a.mcap", sent), tmp_path / "b.mcap")
+    recover(write_foxglove_file(tmp_path / "a.mcap", sent), tmp_path / "b.mcap")
     assert run(tmp_path / "b.mcap", tmp_path / "c.mcap", Settings()) == {"/cf7/camera/image": 3}
 
 
@@ -220,7 +229,9 @@ def test_robots_of_a_recording_of_dmrl_are_renamed(tmp_path: Path) -> None:
         sink.write(5, "/cf3/height", message_class("Height")(height_m=0.5))
     with pytest.raises(SourceError, match="is a recording already"):
         run(path, tmp_path / "b.mcap", Settings())
-    found, left = convert(path, tmp_path / "b.mcap", names="cf2=red,/cf3/height=/blue/height")
+    found, left = convert_and_open(
+        path, tmp_path / "b.mcap", names="cf2=red,/cf3/height=/blue/height"
+    )
     assert not left and set(found.topics) == {"/cf1/labels", "/cf1/range/red", "/blue/height"}
     assert found.labels()["peer"].tolist() == ["red"]
     assert read_summary(tmp_path / "b.mcap").metadata["dmrl.split"] == [{"train": "[[5, 5]]"}]
@@ -240,8 +251,8 @@ def test_json_times_have_several_forms(
 ) -> None:
     data = base64.urlsafe_b64encode(encode_png(PIXELS)).decode().rstrip("=")
     image = {"timestamp": stamp, "frame_id": "c", "format": "png", "data": data}
-    path = json_file(tmp_path / "a.mcap", {"/cam": ("foxglove.CompressedImage", [image])})
-    found, _ = convert(path, tmp_path / "b.mcap")
+    path = write_json_file(tmp_path / "a.mcap", {"/cam": ("foxglove.CompressedImage", [image])})
+    found, _ = convert_and_open(path, tmp_path / "b.mcap")
     assert found["/cf1/camera/image"].to_arrow()["log_time"].to_pylist() == [time_ns]
     assert ("get the bag's times: 1 on /cam" in capsys.readouterr().err) == (stamp == "soon")
 
@@ -251,7 +262,7 @@ def test_json_times_have_several_forms(
 def test_messages_of_ros_beside_others(profile: str, other: str, tmp_path: Path) -> None:
     store = get_typestore(Stores.ROS2_HUMBLE)
     kind = "geometry_msgs/msg/PoseStamped"
-    held, types = a_pose().pose, store.types
+    held, types = build_pose().pose, store.types
     with (tmp_path / "a.mcap").open("wb") as stream:
         writer = PlainWriter(stream)
         writer.start(profile=profile)
@@ -272,7 +283,7 @@ def test_messages_of_ros_beside_others(profile: str, other: str, tmp_path: Path)
             for channel in channels:
                 writer.add_message(channel, START_NS + k, data, START_NS + k)
         writer.finish()
-    found, left = convert(tmp_path / "a.mcap", tmp_path / "b.mcap")
+    found, left = convert_and_open(tmp_path / "a.mcap", tmp_path / "b.mcap")
     table = found["/cf1/pose"].to_arrow()
     assert table["log_time"].to_pylist() == [7_000_000_000 + k for k in range(4)]
     reason = f"messages on /other: my.M in {other} is not converted"

@@ -1,4 +1,4 @@
-"""Topics of any messages by a table: the same numbers in protobuf, JSON and ROS give the same."""
+"""Column maps for topics: equal numbers in protobuf, JSON and ROS give equal recordings."""
 
 import json
 from collections.abc import Callable
@@ -14,10 +14,10 @@ from google.protobuf.descriptor_pb2 import (
 )
 from google.protobuf.descriptor_pool import DescriptorPool
 from google.protobuf.message_factory import GetMessageClass
-from mcap.writer import Writer
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as BagWriter
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from write_mcap.writer import Writer
 
 import dmrl
 from dmrl.errors import SourceError
@@ -68,8 +68,8 @@ SCALARS = {"double": F.TYPE_DOUBLE, "int32": F.TYPE_INT32, "string": F.TYPE_STRI
 ROS = {"double": "float64", "int32": "int32", "string": "string"}
 
 
-def messages(robot: str) -> list[tuple[str, str, int, dict[str, Any]]]:
-    """Topic, type, time and content."""
+def build_messages(robot: str) -> list[tuple[str, str, int, dict[str, Any]]]:
+    """Return topic, type, time in ns and content of all messages of a robot."""
     out: list[tuple[str, str, int, dict[str, Any]]] = []
     for k in range(COUNT):
         t = START_NS + k * 20_000_000
@@ -80,7 +80,8 @@ def messages(robot: str) -> list[tuple[str, str, int, dict[str, Any]]]:
     return out
 
 
-def protobuf(path: Path, sent: list[tuple[str, str, int, dict[str, Any]]]) -> Path:
+def write_protobuf(path: Path, sent: list[tuple[str, str, int, dict[str, Any]]]) -> Path:
+    """Write the messages to an MCAP file in protobuf."""
     file = FileDescriptorProto(name="k.proto", package="my", syntax="proto3")
     for name, fields in KINDS.items():
         kind = file.message_type.add(name=name)
@@ -99,14 +100,14 @@ def protobuf(path: Path, sent: list[tuple[str, str, int, dict[str, Any]]]) -> Pa
         made = GetMessageClass(pool.FindMessageTypeByName(f"my.{kind}"))(**content)
         return bytes(made.SerializeToString())
 
-    return mcap(path, sent, "protobuf", "protobuf", schema, encode)
+    return write_mcap(path, sent, "protobuf", "protobuf", schema, encode)
 
 
-def in_json(path: Path, sent: list[tuple[str, str, int, dict[str, Any]]]) -> Path:
-    return mcap(path, sent, "jsonschema", "json", b"{}", lambda _, c: json.dumps(c).encode())
+def write_json(path: Path, sent: list[tuple[str, str, int, dict[str, Any]]]) -> Path:
+    return write_mcap(path, sent, "jsonschema", "json", b"{}", lambda _, c: json.dumps(c).encode())
 
 
-def mcap(
+def write_mcap(
     path: Path,
     sent: list[tuple[str, str, int, dict[str, Any]]],
     schema_encoding: str,
@@ -114,6 +115,7 @@ def mcap(
     schema: bytes,
     encode: Callable[[str, dict[str, Any]], bytes],
 ) -> Path:
+    """Write messages to an MCAP file with the given encodings."""
     path = path.with_suffix(".mcap")
     with path.open("wb") as stream:
         writer = Writer(stream)
@@ -128,7 +130,8 @@ def mcap(
     return path
 
 
-def ros(path: Path, sent: list[tuple[str, str, int, dict[str, Any]]]) -> Path:
+def write_ros(path: Path, sent: list[tuple[str, str, int, dict[str, Any]]]) -> Path:
+    """Write the messages to a ROS 2 bag."""
     store = get_typestore(Stores.ROS2_HUMBLE)
     for name, fields in KINDS.items():
         lines = [
@@ -159,13 +162,13 @@ def ros(path: Path, sent: list[tuple[str, str, int, dict[str, Any]]]) -> Path:
     return path
 
 
-@pytest.mark.parametrize("write", [protobuf, in_json, ros])
+@pytest.mark.parametrize("write", [write_protobuf, write_json, write_ros])
 @pytest.mark.heavy
 def test_column_map_reads_topics_of_any_encoding(
     write: Callable[[Path, Any], Path], tmp_path: Path
 ) -> None:
-    other = [one for one in messages("cf2") if one[1] != "Uwb"]
-    source = write(tmp_path / "a", messages("red") + other)
+    other = [one for one in build_messages("cf2") if one[1] != "Uwb"]
+    source = write(tmp_path / "a", build_messages("red") + other)
     (tmp_path / "map.toml").write_text(TABLE)
     with count_left_out() as left:
         run(source, tmp_path / "out.mcap", Settings(columns=tmp_path / "map.toml"))
@@ -187,7 +190,9 @@ def test_column_map_reads_topics_of_any_encoding(
 
 
 def test_topics_that_the_table_does_not_name_are_left_out_by_name(tmp_path: Path) -> None:
-    source = in_json(tmp_path / "a", [*messages("red"), ("/chat", "Uwb", START_NS, {"d": 1.0})])
+    source = write_json(
+        tmp_path / "a", [*build_messages("red"), ("/chat", "Uwb", START_NS, {"d": 1.0})]
+    )
     (tmp_path / "map.toml").write_text(TABLE)
     with count_left_out() as left:
         run(source, tmp_path / "out.mcap", Settings(columns=tmp_path / "map.toml"))
@@ -195,9 +200,9 @@ def test_topics_that_the_table_does_not_name_are_left_out_by_name(tmp_path: Path
 
 
 def test_fields_that_are_no_number_are_counted(tmp_path: Path) -> None:
-    some = messages("red")
-    some[1][3]["alt"], some[4][3]["alt"] = "low", None  # JSON's null is no value, not a wrong one
-    source = in_json(tmp_path / "a", some)
+    some = build_messages("red")
+    some[1][3]["alt"], some[4][3]["alt"] = "low", None  # null is a missing value, not a wrong one
+    source = write_json(tmp_path / "a", some)
     (tmp_path / "map.toml").write_text(TABLE)
     with count_left_out() as left:
         run(source, tmp_path / "out.mcap", Settings(columns=tmp_path / "map.toml"))
@@ -218,7 +223,7 @@ def test_fields_that_are_no_number_are_counted(tmp_path: Path) -> None:
     ],
 )
 def test_table_that_fits_no_topic_gives_one_line_error(text: str, why: str, tmp_path: Path) -> None:
-    source = in_json(tmp_path / "a", messages("red"))
+    source = write_json(tmp_path / "a", build_messages("red"))
     (tmp_path / "map.toml").write_text(text)
     with pytest.raises(SourceError, match=why) as e:
         run(source, tmp_path / "out.mcap", Settings(columns=tmp_path / "map.toml"))
@@ -229,7 +234,7 @@ def test_the_time_may_be_a_field(tmp_path: Path) -> None:
     sent = [("/s", "Uwb", START_NS + k, {"z": 1.0, "t": 5 + 0.5 * k}) for k in range(20)]
     table = '[time]\nname = ":t"\nunit = "s"\n[height]\nname = "/s:z"\nunit = "m"\n'
     (tmp_path / "map.toml").write_text(table)
-    source = in_json(tmp_path / "a", sent)
+    source = write_json(tmp_path / "a", sent)
     run(source, tmp_path / "out.mcap", Settings(columns=tmp_path / "map.toml", robot="cf4"))
     times = dmrl.open(tmp_path / "out.mcap")["/cf4/height"].to_arrow()["log_time"].to_pylist()
     assert times == [5_000_000_000 + k * 500_000_000 for k in range(20)]

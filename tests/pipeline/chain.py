@@ -1,4 +1,4 @@
-"""A small pipeline of images, a recording of them, and a derived output."""
+"""Recipe of a small pipeline: images, a recording of them, and a trimmed one."""
 
 HEAD = 'kind = "pipeline"\n'
 PICTURES = f"""{HEAD}
@@ -12,7 +12,7 @@ stage = "convert"
 source = "pictures"
 out = "pictures.mcap"
 """
-"""What others begin with."""
+"""First steps of other recipes."""
 CHAIN = f"""{PICTURES}
 [[step]]
 stage = "trim"

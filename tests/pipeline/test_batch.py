@@ -1,4 +1,4 @@
-"""Folders of recordings: the same bytes with any number of processes, despite failures."""
+"""Commands on folders of recordings: equal output with any number of processes, and failures."""
 
 import json
 import os
@@ -20,12 +20,15 @@ from dmrl.recording import Provenance, RecordingWriter, read_summary
 from dmrl.stages import check, convert, trim
 from dmrl.topics import ATTITUDE
 
+from .test_pipeline import list_children
+
 pytestmark = pytest.mark.heavy
 
 KEPT = trim.Settings(to_s=1.5)
 
 
-def record(path: Path, messages: int = 20, roll_rad: float = 0.0) -> Path:
+def write_recording(path: Path, messages: int = 20, roll_rad: float = 0.0) -> Path:
+    """Write attitudes at 10 Hz, the k-th with a roll of ``roll_rad`` + k."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with RecordingWriter(path, Provenance("test")) as sink:
         for k in range(messages):
@@ -36,17 +39,18 @@ def record(path: Path, messages: int = 20, roll_rad: float = 0.0) -> Path:
 
 @pytest.fixture
 def flights(tmp_path: Path) -> Path:
-    """Four recordings, two of them with one name."""
+    """Return a folder with four recordings, two of equal names in different folders."""
     folder = tmp_path / "flights"
     for k, name in enumerate(("a", "b", "monday/a", "monday/c")):
-        record(folder / f"{name}.mcap", roll_rad=k)
+        write_recording(folder / f"{name}.mcap", roll_rad=k)
     (folder / "notes.txt").write_text("windy")
     (folder / ".hidden").mkdir()
-    record(folder / ".hidden" / "d.mcap")
+    write_recording(folder / ".hidden" / "d.mcap")
     return folder
 
 
-def bytes_in(folder: Path) -> dict[str, bytes]:
+def read_files(folder: Path) -> dict[str, bytes]:
+    """Return the bytes of every file below a folder, by relative path."""
     return {
         str(path.relative_to(folder)): path.read_bytes()
         for path in sorted(folder.rglob("*"))
@@ -54,32 +58,33 @@ def bytes_in(folder: Path) -> dict[str, bytes]:
     }
 
 
-def trimmed(source: Path, out: Path, workers: int = 2, how: trim.Settings = KEPT) -> None:
+def trim_folder(source: Path, out: Path, workers: int = 2, how: trim.Settings = KEPT) -> None:
+    """Trim every recording of a folder."""
     run_over_folder("trim", source, out, how, workers=workers)
 
 
-def test_every_recording_is_found_by_its_place_and_nothing_else(flights: Path) -> None:
+def test_recordings_in_subfolders_are_found_but_not_other_or_hidden_files(flights: Path) -> None:
     names = ["a.mcap", "b.mcap", "monday/a.mcap", "monday/c.mcap"]
     assert [str(name) for name in find_recordings(flights)] == names
     assert [str(name) for name in find_recordings(flights / "*" / "*.mcap")] == names[2:]
     assert [str(name) for name in find_recordings(flights / "mon*")] == names[2:]
     assert list(find_recordings(flights / "a.mcap").values()) == [flights / "a.mcap"]
     outs = flights / "outs"
-    record(outs / "a.mcap")
+    write_recording(outs / "a.mcap")
     assert [str(name) for name in find_recordings(flights, but=outs)] == names
 
 
 def test_special_characters_in_file_names_are_no_pattern(tmp_path: Path) -> None:
-    assert not is_collection(record(tmp_path / "a[1].mcap"))
+    assert not is_collection(write_recording(tmp_path / "a[1].mcap"))
     assert is_collection(tmp_path / "b[1].mcap")
 
 
 def test_batch_outputs_are_independent_of_worker_count(flights: Path, tmp_path: Path) -> None:
-    trimmed(flights, tmp_path / "one", workers=1)
-    trimmed(flights, tmp_path / "two", workers=2)
-    made = bytes_in(tmp_path / "one")
+    trim_folder(flights, tmp_path / "one", workers=1)
+    trim_folder(flights, tmp_path / "two", workers=2)
+    made = read_files(tmp_path / "one")
     assert list(made) == ["a.mcap", "b.mcap", "monday/a.mcap", "monday/c.mcap"]
-    assert made == bytes_in(tmp_path / "two")
+    assert made == read_files(tmp_path / "two")
     trim.run(flights / "monday" / "a.mcap", tmp_path / "alone.mcap", KEPT)
     assert (tmp_path / "alone.mcap").read_bytes() == made["monday/a.mcap"]
 
@@ -89,15 +94,15 @@ def test_failing_recording_does_not_stop_the_batch_and_is_reported(
 ) -> None:
     (flights / "aa.mcap").write_bytes((flights / "a.mcap").read_bytes()[:200])
     with pytest.raises(DmrlError, match=r"1 of 5 recordings failed"):
-        trimmed(flights, tmp_path / "out")
-    assert len(bytes_in(tmp_path / "out")) == 4
+        trim_folder(flights, tmp_path / "out")
+    assert len(read_files(tmp_path / "out")) == 4
     output = capfd.readouterr()
     assert [line for line in output.err.splitlines() if line.startswith("failed: ")] == [
         line for line in output.err.splitlines() if "aa.mcap" in line
     ]
 
 
-def test_a_recording_that_fails_does_not_cost_its_process(
+def test_worker_process_is_reused_after_a_recording_fails(
     flights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     started = []
@@ -110,7 +115,7 @@ def test_a_recording_that_fails_does_not_cost_its_process(
     for name in ("b", "x", "y", "z"):
         (flights / f"{name}.mcap").write_bytes(b"no recording")
     with pytest.raises(DmrlError, match="4 of 7 recordings failed"):
-        trimmed(flights, tmp_path / "out", workers=1)
+        trim_folder(flights, tmp_path / "out", workers=1)
     assert len(started) == 1
     assert len(list((tmp_path / "out").rglob("*.mcap"))) == 3
 
@@ -119,10 +124,10 @@ def test_up_to_date_outputs_are_kept(
     flights: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "out"
-    trimmed(flights, out)
+    trim_folder(flights, out)
     before = {path: path.stat().st_mtime_ns for path in out.rglob("*.mcap")}
     (out / "b.mcap").unlink()
-    trimmed(flights, out)
+    trim_folder(flights, out)
     output = capfd.readouterr().out.splitlines()
     assert [line.split()[1:3] for line in output if "/b.mcap" in line][-1] == ["made", "15"]
     assert sum("was there" in line for line in output) == 3
@@ -137,29 +142,29 @@ def test_existing_output_with_other_inputs_is_refused(
     wrong: str, flights: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "out"
-    trimmed(flights, out)
+    trim_folder(flights, out)
     how = trim.Settings(to_s=1.0) if wrong == "settings" else KEPT
     if wrong == "input":
         (flights / "a.mcap").unlink()
-        record(flights / "a.mcap", roll_rad=9.0)
+        write_recording(flights / "a.mcap", roll_rad=9.0)
     if wrong == "torn":
         (out / "a.mcap").write_bytes((out / "a.mcap").read_bytes()[:-30])
-    before = bytes_in(out)
+    before = read_files(out)
     with pytest.raises(DmrlError, match=f"{4 if wrong == 'settings' else 1} of 4"):
-        trimmed(flights, out, how=how)
-    assert bytes_in(out) == before
+        trim_folder(flights, out, how=how)
+    assert read_files(out) == before
     assert str(out / "a.mcap") in capfd.readouterr().err
 
 
 def test_an_empty_folder_and_the_folder_itself_are_refused(flights: Path, tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     with pytest.raises(RecordingError, match=r"no recording \(.mcap\) in"):
-        trimmed(tmp_path / "empty", tmp_path / "out")
+        trim_folder(tmp_path / "empty", tmp_path / "out")
     assert not (tmp_path / "out").exists()
     with pytest.raises(DmrlError, match="is the folder that is read"):
-        trimmed(flights, flights)
+        trim_folder(flights, flights)
     with pytest.raises(DmrlError, match="is a file"):
-        trimmed(flights, flights / "a.mcap")
+        trim_folder(flights, flights / "a.mcap")
 
 
 def test_check_of_a_folder_is_a_line_each_and_one_for_all(
@@ -201,11 +206,6 @@ def test_sources_in_a_folder_become_recordings_of_their_names(
     assert "README" in capsys.readouterr().err
 
 
-def children(process: int) -> list[int]:
-    tasks = Path(f"/proc/{process}/task").iterdir()  # threads start them
-    return [int(number) for task in tasks for number in (task / "children").read_text().split()]
-
-
 @pytest.mark.skipif(not Path("/proc").is_dir(), reason="looks at processes")
 def test_ctrl_c_ends_the_workers_and_leaves_nothing_half_written(tmp_path: Path) -> None:
     png = encode_png(np.zeros((224, 320, 3), np.uint8))
@@ -222,7 +222,7 @@ def test_ctrl_c_ends_the_workers_and_leaves_nothing_half_written(tmp_path: Path)
     while len(list((tmp_path / "out").glob("*.partial"))) < 2:
         assert running.poll() is None
         time.sleep(0.01)
-    workers = children(running.pid)
+    workers = list_children(running.pid)
     assert len(workers) == 2
     running.send_signal(signal.SIGINT)
     _, output = running.communicate()

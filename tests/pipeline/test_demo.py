@@ -1,4 +1,4 @@
-"""The demo: the shipped flight, and its figures with dmrl-nano."""
+"""The demo: its shipped flight, and the accuracy of dmrl-nano on it."""
 
 import hashlib
 import json
@@ -15,7 +15,7 @@ from dmrl.stages.demo import suggest_commands
 
 FLIGHT = Path(__file__).parents[2] / "recipes/demo_flight.mcap"
 SHA256 = "ccd119a831c802188a0c78f2ad84d02a0363806670633ffa6a8a68fa8eaf1b74"
-"""Hash of the output of ``dmrl fly demo_flight recipes/demo_flight.mcap``."""
+"""SHA-256 of the output of ``dmrl fly demo_flight recipes/demo_flight.mcap``."""
 
 
 def test_the_flight_that_ships_is_small_and_the_one_that_was_made() -> None:

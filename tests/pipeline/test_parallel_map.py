@@ -1,4 +1,4 @@
-"""Work in several processes: order, errors, deaths, and no leftover process."""
+"""Work in several processes: order, errors, killed workers, and no leftover process."""
 
 import multiprocessing
 import os
@@ -13,9 +13,9 @@ import pytest
 from dmrl.errors import RecordingError, SettingError
 from dmrl.pipeline.parallel_map import parallel_map
 
-pytestmark = pytest.mark.heavy  # a process takes half a second to begin
+pytestmark = pytest.mark.heavy  # a process takes half a second to start
 
-WAITS = """
+WAIT_PROGRAM = """
 import sys, time
 from pathlib import Path
 from test_parallel_map import wait_there
@@ -25,7 +25,7 @@ if __name__ == "__main__":
     list(parallel_map(wait_there, [Path(sys.argv[1])] * 2, 2))
 """
 
-HEARS = """
+SIGNAL_PROGRAM = """
 import signal
 from test_parallel_map import hears_ctrl_c
 from dmrl.pipeline.parallel_map import parallel_map
@@ -37,11 +37,12 @@ if __name__ == "__main__":
 
 @pytest.fixture(autouse=True)
 def importable(monkeypatch: pytest.MonkeyPatch) -> None:
-    """New processes import this module by its name."""
+    """Let new processes import this module by its name."""
     monkeypatch.syspath_prepend(Path(__file__).parents[2])
 
 
 def twice(value: int) -> tuple[int, int, str]:
+    """Return twice the value, the process ID, and the number of OpenMP threads."""
     return 2 * value, os.getpid(), os.environ.get("OMP_NUM_THREADS", "")
 
 
@@ -55,23 +56,25 @@ def die(value: int) -> None:
     os.kill(os.getpid(), signal.SIGKILL)
 
 
-def much(value: int) -> bytes:
+def return_50_mb(value: int) -> bytes:
     return bytes(50_000_000)
 
 
 def wait_there(folder: Path) -> None:
+    """Make a file named by the process ID, and wait."""
     (folder / str(os.getpid())).touch()
     time.sleep(60)
 
 
 def hears_ctrl_c(_: int) -> bool:
+    """Return whether this process receives SIGINT."""
     return signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, [])
 
 
 def test_only_the_process_that_starts_others_hears_ctrl_c(tmp_path: Path) -> None:
-    """One that still starts would print a traceback."""
+    """A worker that is interrupted while it starts would print a traceback."""
     script = tmp_path / "hears.py"
-    script.write_text(HEARS)
+    script.write_text(SIGNAL_PROGRAM)
     environment = os.environ | {"PYTHONPATH": str(Path(__file__).parent)}
     done = subprocess.run(
         [sys.executable, str(script)], env=environment, capture_output=True, text=True, check=True
@@ -104,9 +107,9 @@ def test_killed_process_gives_one_line_error() -> None:
 
 
 @pytest.mark.parametrize("after_s", [0.0, 0.01, 0.05])
-def test_processes_that_are_amid_an_answer_end_too(after_s: float) -> None:
-    """Half of an answer in a pipe was waited for, for ever."""
-    results = parallel_map(much, range(9), 2)
+def test_closing_ends_workers_that_are_sending_an_answer(after_s: float) -> None:
+    """The parent must not wait for the rest of an answer that is partly in the pipe."""
+    results = parallel_map(return_50_mb, range(9), 2)
     assert len(next(results)) == 50_000_000
     time.sleep(after_s)
     results.close()
@@ -118,7 +121,7 @@ def test_no_process_outlives_the_one_that_began_it(number: int, tmp_path: Path) 
     there = tmp_path / "there"
     there.mkdir()
     script = tmp_path / "waits.py"
-    script.write_text(WAITS)
+    script.write_text(WAIT_PROGRAM)
     process = subprocess.Popen(
         [sys.executable, str(script), str(there)],
         env=os.environ | {"PYTHONPATH": str(Path(__file__).parent)},
@@ -130,15 +133,16 @@ def test_no_process_outlives_the_one_that_began_it(number: int, tmp_path: Path) 
         time.sleep(0.02)
     process.send_signal(number)
     until_s = time.monotonic() + 20
-    while [p for p in there.iterdir() if _runs(int(p.name))] and time.monotonic() < until_s:
+    while [p for p in there.iterdir() if is_running(int(p.name))] and time.monotonic() < until_s:
         time.sleep(0.05)
-    left = [p.name for p in there.iterdir() if _runs(int(p.name))]
+    left = [p.name for p in there.iterdir() if is_running(int(p.name))]
     process.kill()
     process.wait()
     assert not left
 
 
-def _runs(number: int) -> bool:
+def is_running(number: int) -> bool:
+    """Return whether a process exists and is no zombie."""
     try:
         state = Path(f"/proc/{number}/stat").read_text().rpartition(")")[2].split()[0]
     except OSError:

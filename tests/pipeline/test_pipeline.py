@@ -1,4 +1,4 @@
-"""Pipelines in processes: the same bytes, kills, and ownership of a folder."""
+"""Pipelines in several processes: equal bytes, kills, and the ownership of their folder."""
 
 import errno
 import json
@@ -30,14 +30,15 @@ each = { n = "1-2" }
 """
 
 
-def write(folder: Path, text: str) -> Path:
+def write_recipe(folder: Path, text: str) -> Path:
+    """Write a recipe."""
     path = folder / "small.toml"
     path.write_text(text, encoding="utf-8")
     return path
 
 
-def contents(folder: Path) -> dict[str, bytes]:
-    """Everything that steps wrote, by name."""
+def read_outputs(folder: Path) -> dict[str, bytes]:
+    """Return the bytes of every file that steps wrote, by relative path."""
     own = {"pipeline.json", "recipe.toml"}
     files = (path for path in folder.rglob("*") if path.is_file() and path.name not in own)
     return {str(path.relative_to(folder)): path.read_bytes() for path in files}
@@ -47,13 +48,13 @@ def contents(folder: Path) -> dict[str, bytes]:
 def test_a_pipeline_gives_the_same_bytes_with_any_number_of_workers(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    recipe, one, two = write(tmp_path, SMALL), tmp_path / "one", tmp_path / "two"
+    recipe, one, two = write_recipe(tmp_path, SMALL), tmp_path / "one", tmp_path / "two"
     pipeline.run(recipe, one, workers=1)
     done = pipeline.run(recipe, two, workers=2)
     assert not any(d.skipped for d in done)
     outs = {"1.mcap", "2.mcap", "all.mcap", "end.mcap", "pictures-1", "pictures-2"}
     assert {p.name for p in two.iterdir()} == outs | {"pipeline.json", "recipe.toml"}
-    assert contents(one) == contents(two)
+    assert read_outputs(one) == read_outputs(two)
     assert (two / "recipe.toml").read_text() == SMALL
     capsys.readouterr()
     again = pipeline.run(recipe, two)
@@ -65,17 +66,20 @@ def test_a_pipeline_gives_the_same_bytes_with_any_number_of_workers(
 
 @pytest.mark.heavy
 def test_an_edited_recipe_goes_on_in_the_same_folder(tmp_path: Path) -> None:
-    recipe, out = write(tmp_path, SMALL.replace("from_s = 0.05", "from_s = 99.0")), tmp_path / "o"
+    recipe, out = (
+        write_recipe(tmp_path, SMALL.replace("from_s = 0.05", "from_s = 99.0")),
+        tmp_path / "o",
+    )
     with pytest.raises(DmrlError, match=r"^end\.mcap \(trim\): "):
         pipeline.run(recipe, out, workers=2)
     assert (out / "all.mcap").is_file() and not (out / "end.mcap").exists()
-    done = pipeline.run(write(tmp_path, f"# {SMALL}"), out, workers=2)
+    done = pipeline.run(write_recipe(tmp_path, f"# {SMALL}"), out, workers=2)
     assert [d.stage for d in done if not d.skipped] == ["trim"]
 
 
 def test_missing_data_is_an_error_before_any_step(tmp_path: Path) -> None:
     text = SMALL.replace('source = "pictures-{n}"', 'source = "{data}/{n}"')
-    recipe, data, out = write(tmp_path, text), tmp_path / "data", tmp_path / "out"
+    recipe, data, out = write_recipe(tmp_path, text), tmp_path / "data", tmp_path / "out"
     with pytest.raises(SettingError, match="Say where: --data DIR"):
         pipeline.run(recipe, out)
     with pytest.raises(SettingError, match="no folder"):
@@ -84,7 +88,7 @@ def test_missing_data_is_an_error_before_any_step(tmp_path: Path) -> None:
     with pytest.raises(SettingError, match=r"no .*data/1 and 1 more that .* reads"):
         pipeline.run(recipe, out, data)
     with pytest.raises(RecipeError, match="leads out of its folder"):
-        pipeline.run(write(tmp_path, text.replace("{data}/", "{data}/../")), out, data)
+        pipeline.run(write_recipe(tmp_path, text.replace("{data}/", "{data}/../")), out, data)
     assert not out.exists()
 
 
@@ -93,10 +97,10 @@ def test_foreign_folder_is_not_overwritten(tmp_path: Path) -> None:
     foreign.mkdir()
     (foreign / "recipe.toml").write_text("mine")
     with pytest.raises(OutputError, match="is not empty"):
-        pipeline.run(write(tmp_path, SMALL), foreign)
+        pipeline.run(write_recipe(tmp_path, SMALL), foreign)
     assert [p.name for p in foreign.iterdir()] == ["recipe.toml"]
     with pytest.raises(OutputError, match=r"is a file\. Name a folder"):
-        pipeline.run(write(tmp_path, SMALL), foreign / "recipe.toml")
+        pipeline.run(write_recipe(tmp_path, SMALL), foreign / "recipe.toml")
 
 
 ONE = 'kind = "pipeline"\n[[step]]\nstage = "sketch"\nout = "pictures"\nimages = 1\n'
@@ -104,11 +108,11 @@ ONE = 'kind = "pipeline"\n[[step]]\nstage = "sketch"\nout = "pictures"\nimages =
 
 @pytest.mark.heavy
 def test_partial_files_of_a_failed_start_do_not_block_the_folder(tmp_path: Path) -> None:
-    """The first thing written could neither be finished nor removed; now the disk is well."""
+    """Such files are left if a full disk lets the first file be neither finished nor removed."""
     out = tmp_path / "out"
     (out / "unfinished").mkdir(parents=True)
     (out / "pipeline.json.partial").write_text("{")
-    (done,) = pipeline.run(write(tmp_path, ONE), out, workers=1)
+    (done,) = pipeline.run(write_recipe(tmp_path, ONE), out, workers=1)
     assert not done.skipped
     assert {p.name for p in out.iterdir()} == {"pictures", "pipeline.json", "recipe.toml"}
 
@@ -128,11 +132,11 @@ def test_os_error_in_a_step_is_no_internal_error(
 
 
 LONG = SMALL.replace("images = 2", "images = 900")
-"""Runs for a while, and has one run at a time in a folder."""
+"""A recipe that takes long enough to be killed."""
 
 
-def started(recipe: Path, out: Path) -> tuple["subprocess.Popen[str]", list[int]]:
-    """A run that has begun two steps, and its processes."""
+def start_run(recipe: Path, out: Path) -> tuple["subprocess.Popen[str]", list[int]]:
+    """Start a run, wait until it works on two steps, and return it with its worker processes."""
     command = [sys.executable, "-m", "dmrl.cli", "run", str(recipe), "--out", str(out)]
     running = subprocess.Popen(
         [*command, "--workers", "2"],
@@ -145,17 +149,17 @@ def started(recipe: Path, out: Path) -> tuple["subprocess.Popen[str]", list[int]
     while not all(place.exists() for place in places):
         assert running.poll() is None, running.communicate()
         time.sleep(0.05)
-    return running, children(running.pid)
+    return running, list_children(running.pid)
 
 
-def children(parent: int) -> list[int]:
-    """Processes that a process has started."""
+def list_children(parent: int) -> list[int]:
+    """Return the process IDs of the children of a process, which any of its threads started."""
     tasks = Path(f"/proc/{parent}/task").glob("*/children")
     return [int(number) for task in tasks for number in task.read_text().split()]
 
 
 def is_process_gone(number: int) -> bool:
-    """Whether there is no such process, or one that waits to be buried."""
+    """Return whether a process does not exist or is a zombie."""
     try:
         return Path(f"/proc/{number}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
     except FileNotFoundError:
@@ -166,8 +170,8 @@ def is_process_gone(number: int) -> bool:
 @pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="no /proc")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
 def test_no_process_outlives_a_run_that_is_stopped(tmp_path: Path, number: signal.Signals) -> None:
-    recipe, out = write(tmp_path, LONG), tmp_path / "out"
-    running, workers = started(recipe, out)
+    recipe, out = write_recipe(tmp_path, LONG), tmp_path / "out"
+    running, workers = start_run(recipe, out)
     assert len(workers) == 2
     with pytest.raises(OutputError, match="another dmrl run is at work"):
         pipeline.run(recipe, out)
@@ -178,20 +182,20 @@ def test_no_process_outlives_a_run_that_is_stopped(tmp_path: Path, number: signa
         time.sleep(0.05)
     assert "Traceback" not in output
     killed = number == signal.SIGKILL
-    assert (out / "unfinished").exists() == killed  # who is told tidies up
-    done = pipeline.run(write(tmp_path, SMALL), out, workers=2)
+    assert (out / "unfinished").exists() == killed  # an interrupted run removes it
+    done = pipeline.run(write_recipe(tmp_path, SMALL), out, workers=2)
     assert not any(d.skipped for d in done) and not (out / "unfinished").exists()
 
 
 @pytest.mark.heavy
 def test_killed_worker_gives_one_line_error(tmp_path: Path) -> None:
-    before = set(children(os.getpid()))
+    before = set(list_children(os.getpid()))
     with ProcessPool(1) as crew:
         line = build_job("sketch", tmp_path / "a", {}, {"images": 9000}, resume=False)
         answer = crew.submit(line, exclusive=False)
         while not (tmp_path / "a.partial").exists():
             time.sleep(0.05)
-        (worker,) = set(children(os.getpid())) - before
+        (worker,) = set(list_children(os.getpid())) - before
         os.kill(worker, signal.SIGKILL)
         assert answer.result()["error"].startswith("its process was killed (signal 9)")
         line = build_job("sketch", tmp_path / "b", {}, {"images": 1}, resume=False)

@@ -30,7 +30,8 @@ out = "both.mcap"
 """
 
 
-def load(folder: Path, text: str) -> Plan:
+def load_recipe(folder: Path, text: str) -> Plan:
+    """Write a recipe and load its plan."""
     path = folder / "mine.toml"
     path.write_text(text, encoding="utf-8")
     return load_plan(path)
@@ -40,7 +41,7 @@ load_shipped = cache(load_plan)
 
 
 def test_step_keys_become_inputs_or_settings(tmp_path: Path) -> None:
-    plan = load(tmp_path, SMALL)
+    plan = load_recipe(tmp_path, SMALL)
     assert plan.steps == (
         Step("sketch", "pictures", settings={"images": 2}),
         Step("convert", "pictures.mcap", {"source": "pictures"}),
@@ -51,12 +52,12 @@ def test_step_keys_become_inputs_or_settings(tmp_path: Path) -> None:
 
 def test_one_name_for_an_input_of_many_is_a_list_of_one(tmp_path: Path) -> None:
     text = 'step = [{ stage = "evaluate", recordings = "{data}/f.mcap", out = "judged" }]'
-    assert load(tmp_path, HEAD + text).steps[0].inputs == {"recordings": ["{data}/f.mcap"]}
+    assert load_recipe(tmp_path, HEAD + text).steps[0].inputs == {"recordings": ["{data}/f.mcap"]}
 
 
 def test_step_order_follows_dependencies(tmp_path: Path) -> None:
     _, *blocks = SMALL.split("[[step]]")
-    plan = load(tmp_path, HEAD + "".join(f"[[step]]{block}\n" for block in reversed(blocks)))
+    plan = load_recipe(tmp_path, HEAD + "".join(f"[[step]]{block}\n" for block in reversed(blocks)))
     assert list(plan.order.static_order()) == ["pictures", "pictures.mcap", "both.mcap"]
 
 
@@ -68,38 +69,38 @@ def test_a_setting_that_names_a_file_is_something_that_is_read(tmp_path: Path) -
       { stage = "render", camera = "aideck", images = 2, out = "r.mcap" },
     ]
     """
-    plan = load(tmp_path, HEAD + text)
+    plan = load_recipe(tmp_path, HEAD + text)
     assert plan.steps[0].names == ["{data}/f.mcap", "c.toml"]
     assert list(plan.order.static_order()).index("c.toml") == 0 or "c.toml" in plan.steps[0].names
     with pytest.raises(RecipeError, match=r"label reads d\.toml, which no step writes"):
-        load(tmp_path, HEAD + text.replace('cf1 = "c.toml"', 'cf1 = "d.toml"'))
+        load_recipe(tmp_path, HEAD + text.replace('cf1 = "c.toml"', 'cf1 = "d.toml"'))
 
 
 def test_keys_come_before_those_of_a_recipe_and_its_preset(tmp_path: Path) -> None:
     path = tmp_path / "rooms.toml"
     path.write_text('kind = "render"\npreset = "himax"\nimages = 7\nseed = 3\n')
     text = f'step = [{{ stage = "render", out = "r.mcap", recipe = "{path}", images = 2 }}]'
-    (step,) = load(tmp_path, HEAD + text).steps
+    (step,) = load_recipe(tmp_path, HEAD + text).steps
     assert (step.settings["images"], step.settings["seed"]) == (2, 3)
     assert "preset" not in step.settings and "shot_noise" in step.settings
     with pytest.raises(RecipeError, match="is of kind 'render'"):
-        load(tmp_path, HEAD + text.replace('stage = "render"', 'stage = "fly"'))
+        load_recipe(tmp_path, HEAD + text.replace('stage = "render"', 'stage = "fly"'))
 
 
 def test_an_error_that_ends_with_a_question_has_no_period_behind_it(tmp_path: Path) -> None:
     with pytest.raises(RecipeError, match=r"1 wrong key: .* Did you mean images\? Fix it$"):
-        load(tmp_path, SMALL.replace("images = 2", "imags = 2"))
+        load_recipe(tmp_path, SMALL.replace("images = 2", "imags = 2"))
 
 
 def test_an_argument_of_the_command_line_alone_is_named(tmp_path: Path) -> None:
     with pytest.raises(RecipeError, match="workers: sketch takes it on the command line alone"):
-        load(tmp_path, SMALL.replace("images = 2", "images = 2\nworkers = 2"))
+        load_recipe(tmp_path, SMALL.replace("images = 2", "images = 2\nworkers = 2"))
 
 
 def test_every_fault_is_named_with_its_step(tmp_path: Path) -> None:
     text = SMALL.replace("images = 2", "imags = 2\nseed = 1.5").replace("source =", "sources =")
     with pytest.raises(RecipeError) as caught:
-        load(tmp_path, "sed = 3\n" + text)
+        load_recipe(tmp_path, "sed = 3\n" + text)
     said = str(caught.value)
     assert "5 wrong keys" in said and "\n" not in said
     for words in (
@@ -148,7 +149,7 @@ def test_every_fault_is_named_with_its_step(tmp_path: Path) -> None:
 def test_wrong_step_gives_one_line_error(tmp_path: Path, old: str, new: str, words: str) -> None:
     assert old in SMALL
     with pytest.raises(RecipeError) as caught:
-        load(tmp_path, SMALL.replace(old, new))
+        load_recipe(tmp_path, SMALL.replace(old, new))
     assert words in str(caught.value) and "\n" not in str(caught.value)
 
 
@@ -176,7 +177,8 @@ def test_every_command_that_writes_is_a_step(stage: str) -> None:
     assert not set(takes.roles) & set(getattr(own, "__dataclass_fields__", {}))
 
 
-def of_interface(stage: str) -> tuple[Any, ...]:
+def get_interface(stage: str) -> tuple[Any, ...]:
+    """Return inputs, path settings and flags of a stage, from its signature."""
     takes = signature_of(stage)
     roles = {name: (role.many, role.required) for name, role in takes.roles.items()}
     return roles, set(takes.paths), takes.resumes, takes.exclusive
@@ -186,10 +188,10 @@ def test_stage_interface_is_read_from_its_run_signature() -> None:
     one, maybe, many = (False, True), (False, False), (True, True)
     few = (True, False)
     train = {"dataset": one, "init": maybe, "teacher": maybe, "unlabelled": few}
-    assert of_interface("train") == (train, set(), True, True)
-    assert of_interface("calibrate") == ({"sources": many}, {"camera"}, False, False)
-    assert of_interface("verify") == ({"folder": one}, {"dataset"}, False, False)
-    assert of_interface("merge") == ({"recordings": many}, set(), False, False)
+    assert get_interface("train") == (train, set(), True, True)
+    assert get_interface("calibrate") == ({"sources": many}, {"camera"}, False, False)
+    assert get_interface("verify") == ({"folder": one}, {"dataset"}, False, False)
+    assert get_interface("merge") == ({"recordings": many}, set(), False, False)
     assert list(signature_of("record").others) == ["robots"]
 
 
@@ -203,26 +205,26 @@ def test_a_stage_that_a_package_adds_is_a_step(
         entry_points, "find_plugins", lambda group: {"smooth": smooth} if group else {}
     )
     text = 'step = [{ stage = "smooth", recording = "{data}/f.mcap", out = "s.mcap" }]'
-    assert load(tmp_path, HEAD + text).steps[0].inputs == {"recording": "{data}/f.mcap"}
+    assert load_recipe(tmp_path, HEAD + text).steps[0].inputs == {"recording": "{data}/f.mcap"}
     with pytest.raises(RecipeError, match=r"no stage 'smoth'\. Did you mean smooth\?"):
-        load(tmp_path, HEAD + text.replace("smooth", "smoth"))
+        load_recipe(tmp_path, HEAD + text.replace("smooth", "smoth"))
 
 
 def test_other_arguments_of_run_are_checked_as_well(tmp_path: Path) -> None:
     robots = '{ name = "cf1", uri = "radio://0/80/2M/E7E7E7E7E7" }'
     text = f'{HEAD}step = [{{ stage = "record", out = "f.mcap", robots = [{robots}] }}]'
-    assert load(tmp_path, text).steps[0].settings["robots"][0]["name"] == "cf1"
+    assert load_recipe(tmp_path, text).steps[0].settings["robots"][0]["name"] == "cf1"
     for wrong, words in ((", robots = 3", "step.1.robots: "), ("", "step.1.robots: is required")):
         with pytest.raises(RecipeError, match=words):
-            load(tmp_path, text.replace(f", robots = [{robots}]", wrong))
+            load_recipe(tmp_path, text.replace(f", robots = [{robots}]", wrong))
 
 
 SELF_SUPERVISED = "b48563588f4cb89d31ea5f7cb9756e611f05039ee0a33cb01c6c5c916dba6722"
-"""Of 1805 steps: what the recipe stood for when it said each of them, in 326 lines."""
+"""SHA-256 of the 1805 steps that the recipe expands to."""
 
 
 def step_as_dict(step: Step) -> dict[str, Any]:
-    """A step with those of its settings that are not as they usually are."""
+    """Return a step as a dictionary, with only the settings that differ from their defaults."""
     takes = step.signature
     assert takes.settings is not None
     usual = recipe.to_json_values(asdict(takes.settings()))
@@ -232,7 +234,7 @@ def step_as_dict(step: Step) -> dict[str, Any]:
 
 
 @pytest.mark.heavy
-def test_recipe_self_supervised_has_its_number_of_steps() -> None:
+def test_recipe_self_supervised_expands_to_known_steps() -> None:
     steps = load_shipped("self_supervised").steps
     assert len(recipe.read_text("self_supervised").splitlines()) <= 100
     assert Counter(step.stage for step in steps) == {
@@ -247,12 +249,14 @@ def test_recipe_self_supervised_has_its_number_of_steps() -> None:
 PAGE = Path(__file__).parents[2] / "docs" / "pipelines.md"
 
 
-WHOLE = re.findall(r"```toml\n(kind = .*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
+PIPELINES_OF_PAGE = re.findall(
+    r"```toml\n(kind = .*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL
+)
 
 
-@pytest.mark.parametrize("text", WHOLE)
+@pytest.mark.parametrize("text", PIPELINES_OF_PAGE)
 def test_recipes_of_the_page_can_be_loaded(tmp_path: Path, text: str) -> None:
-    assert len(load(tmp_path, text).steps) in (10, 5)
+    assert len(load_recipe(tmp_path, text).steps) in (10, 5)
 
 
 @pytest.mark.parametrize("name", recipe.list_names())
@@ -281,7 +285,7 @@ def test_adapting_calibrates_on_images_that_it_does_not_learn_from(name: str) ->
 def test_figure_of_an_unknown_output_is_a_fault(tmp_path: Path) -> None:
     figure = '[[figure]]\ntitle = "Losses"\nshows = "losses"\nof = ["model"]\n'
     with pytest.raises(RecipeError, match=r"figure\.1\.of: no step writes model"):
-        load(tmp_path, SMALL + figure)
+        load_recipe(tmp_path, SMALL + figure)
 
 
 @pytest.mark.heavy

@@ -1,4 +1,4 @@
-"""A recording is made again from its provenance."""
+"""Rebuilding a recording from its provenance."""
 
 import json
 from dataclasses import replace
@@ -20,7 +20,8 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Inputs:
     return Inputs(tmp_path_factory.mktemp("inputs"))
 
 
-def cut(source: Path, out: Path, end_s: float) -> Path:
+def trim_recording(source: Path, out: Path, end_s: float) -> Path:
+    """Trim a recording to its first seconds."""
     trim.run(source, out, trim.Settings(to_s=end_s))
     return out
 
@@ -29,10 +30,10 @@ def cut(source: Path, out: Path, end_s: float) -> Path:
 def test_a_recording_is_made_again_with_the_inputs_that_are_absent(
     inputs: Inputs, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    long = cut(inputs.dots, tmp_path / "long.mcap", 0.9)
-    short = cut(long, tmp_path / "short.mcap", 0.5)
+    long = trim_recording(inputs.dots, tmp_path / "long.mcap", 0.9)
+    short = trim_recording(long, tmp_path / "short.mcap", 0.5)
     long.unlink()
-    with pytest.raises(DmrlError, match="no stage 'test'"):  # of dots.mcap
+    with pytest.raises(DmrlError, match="no stage 'test'"):  # the stage of dots.mcap
         rebuild(short, tmp_path / "never.mcap")
     run.command(str(short), out=tmp_path / "new.mcap", data=inputs.dots.parent, as_json=True)
     assert json.loads(capsys.readouterr().out) == {"same": True, "differences": []}
@@ -40,13 +41,13 @@ def test_a_recording_is_made_again_with_the_inputs_that_are_absent(
     assert sorted(p.name for p in tmp_path.iterdir()) == ["new.mcap", "short.mcap"]
 
 
-def test_what_came_out_otherwise_is_printed(
+def test_differences_of_a_rebuilt_recording_are_printed(
     inputs: Inputs,
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    short = cut(inputs.dots, tmp_path / "short.mcap", 0.5)
+    short = trim_recording(inputs.dots, tmp_path / "short.mcap", 0.5)
     summary = read_summary(short)
     assert summary.provenance is not None
     settings = {**summary.provenance.settings, "to_s": 0.3}
@@ -68,7 +69,7 @@ def test_a_recording_of_others_is_refused(tmp_path: Path) -> None:
 
 @pytest.mark.heavy
 def test_a_simulated_flight_and_its_detections_are_made_again(tmp_path: Path) -> None:
-    """Settings alone determine the flight; the network ships and is found by its name."""
+    """The settings alone determine the flight, and the network is found by its name."""
     settings = fly.Settings(duration_s=2.0, camera=True, camera_renderer="sketch", seed=5)
     fly.run(tmp_path / "flight.mcap", settings)
     predict.run(

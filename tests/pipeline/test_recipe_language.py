@@ -9,14 +9,16 @@ from dmrl.guards import limits
 from dmrl.pipeline.recipe_language import expand_steps
 
 
-def steps(text: str) -> list[dict[str, Any]]:
+def expand_valid(text: str) -> list[dict[str, Any]]:
+    """Expand a recipe and assert that it has no faults."""
     faults: list[str] = []
     found = expand_steps(tomllib.loads(text), faults)
     assert not faults
     return [step for _, step in found]
 
 
-def faults(text: str) -> list[str]:
+def find_faults(text: str) -> list[str]:
+    """Return the faults of a recipe."""
     found: list[str] = []
     expand_steps(tomllib.loads(text), found)
     return found
@@ -33,7 +35,7 @@ step = [
 
 @pytest.mark.parametrize("values", ['"3-5"', "[3, 4, 5]"])
 def test_a_name_in_out_repeats_and_in_inputs_alone_gathers(values: str) -> None:
-    assert steps(FLIGHTS + f"flight = {values}") == [
+    assert expand_valid(FLIGHTS + f"flight = {values}") == [
         *[
             {"stage": "fly", "seed": n, "title": f"no. {n}", "out": f"flight-{n}.mcap"}
             for n in (3, 4, 5)
@@ -61,7 +63,7 @@ train = { epochs = 8, seed = 5 }
 
 def test_rows_set_values_and_missing_values_drop_keys_or_steps() -> None:
     train, predict = {"stage": "train", "seed": 5}, {"stage": "predict", "model": "model-1"}
-    assert steps(ROUNDS) == [
+    assert expand_valid(ROUNDS) == [
         {**train, "epochs": 8, "dataset": "flown", "out": "model-1"},
         {**train, "epochs": 4, "dataset": "seen", "out": "model-last"},
         {**predict, "out": "seen-last-cf1"},
@@ -70,7 +72,7 @@ def test_rows_set_values_and_missing_values_drop_keys_or_steps() -> None:
 
 
 def test_data_placeholder_is_kept_and_values_are_not_expanded_again() -> None:
-    (step,) = steps(
+    (step,) = expand_valid(
         'step = [{ stage = "convert", source = "{data}/{log}.csv", out = "a" }]\n'
         '[each]\nlog = ["{data}"]'
     )
@@ -108,7 +110,7 @@ ONE = 'step = [{ stage = "fly", out = "f-{a}", seed = "{a}" }]\n[each]\n'
     ],
 )
 def test_invalid_recipe_is_a_fault(text: str, fault: str) -> None:
-    assert any(found.startswith(fault) for found in faults(text)), faults(text)
+    assert any(found.startswith(fault) for found in find_faults(text)), find_faults(text)
 
 
 MANY = '"1-9999"'

@@ -1,4 +1,4 @@
-"""Steps that are run or skipped, and the fate of earlier outputs."""
+"""Which steps are run or skipped, and what happens to earlier outputs."""
 
 import json
 import os
@@ -27,8 +27,8 @@ BOTH = Step("merge", "both", {"recordings": ["a", "b"]})
 LAST = Step("trim", "last", {"recording": "both"}, {"to_s": 3.0})
 
 
-class Pretender(ProcessPool):
-    """Writes what it was told as the output, at once: content follows settings and inputs."""
+class FakePool(ProcessPool):
+    """Runs no stage: it writes the settings and the content of the inputs as the output."""
 
     def __init__(self, fails: tuple[str, ...] = ()) -> None:
         super().__init__(2)
@@ -61,18 +61,18 @@ def _list(given: Any) -> list[str]:
     return given if isinstance(given, list) else [given]
 
 
-Run = Callable[..., tuple[list[StepOutcome], Pretender]]
+Run = Callable[..., tuple[list[StepOutcome], FakePool]]
 
 
 @pytest.fixture
 def run(tmp_path: Path) -> Run:
-    """Runs steps in one folder, as often as it is called."""
+    """Return a function that runs steps in one folder, with the outputs of earlier calls."""
     (tmp_path / "unfinished").mkdir()
 
     def runs(
         *steps: Step, data: Path | None = None, **how: Any
-    ) -> tuple[list[StepOutcome], Pretender]:
-        with Pretender(**how) as crew:
+    ) -> tuple[list[StepOutcome], FakePool]:
+        with FakePool(**how) as crew:
             memory = BuildCache.load(tmp_path / "pipeline.json")
             return Runner(Plan(steps, ""), tmp_path, data, memory).run(crew), crew
 
@@ -96,7 +96,7 @@ def test_changed_setting_reruns_only_dependent_steps(run: Run) -> None:
     assert crew.made == ["last"]
     _, crew = run(A, Step("sketch", "b", settings={"seed": 3}), BOTH, LAST)
     assert crew.made == ["b", "both", "last"]
-    same = Step("sketch", "b", settings={"seed": 3, "images": 600})  # as many as usual
+    same = Step("sketch", "b", settings={"seed": 3, "images": 600})  # 600 is the default
     assert not run(A, same, BOTH, Step(LAST.stage, "last", LAST.inputs, {"to_s": 3}))[1].made
 
 
@@ -118,14 +118,14 @@ def test_changed_input_is_detected_by_content(run: Run, tmp_path: Path) -> None:
     shutil.copytree(data, moved)
     assert not run(*steps, data=moved)[1].made
     (moved / "log").write_text("two")
-    os.utime(moved / "log", ns=(1, 1))  # as long, and by the clock as old
+    os.utime(moved / "log", ns=(1, 1))  # equal size and modification time
     assert run(*steps, data=moved)[1].made == ["x", "y"]
 
 
 def test_renamed_input_counts_as_changed(run: Run, tmp_path: Path) -> None:
     for name in ("one", "two"):
         (tmp_path / name).write_text("same")
-    for name in ("one", "two"):  # names of inputs stand in provenance
+    for name in ("one", "two"):  # the provenance has the names of inputs
         assert run(Step("convert", "x", {"source": f"{{data}}/{name}"}), data=tmp_path)[1].made
 
 
@@ -194,7 +194,7 @@ def test_killed_step_resumes_unless_it_changed(run: Run, tmp_path: Path) -> None
 
     def render(seed: int) -> tuple[bool, bool]:
         step = Step("render", "r.mcap", settings={"seed": seed, "workers": seed})
-        with pytest.raises(DmrlError), Pretender(fails=("r.mcap",)) as crew:
+        with pytest.raises(DmrlError), FakePool(fails=("r.mcap",)) as crew:
             memory = BuildCache.load(tmp_path / "pipeline.json")
             Runner(Plan((step,), ""), tmp_path, None, memory).run(crew)
         return crew.jobs[0]["resume"], partial.exists()
@@ -211,7 +211,7 @@ def test_workers_of_a_stage_are_no_reason_to_run_it_again(run: Run) -> None:
     assert done[0].skipped and not crew.made
 
 
-def test_an_output_that_was_whole_at_a_kill_is_not_made_twice(run: Run, tmp_path: Path) -> None:
+def test_output_completed_before_a_kill_is_not_made_again(run: Run, tmp_path: Path) -> None:
     run(A)
     memory = json.loads((tmp_path / "pipeline.json").read_text())
     (tmp_path / "a").rename(tmp_path / "unfinished" / "a")

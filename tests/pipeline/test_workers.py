@@ -1,4 +1,4 @@
-"""Every command with --workers gives the same output with any number of them."""
+"""Every command with --workers gives the same output with any number of workers."""
 
 import inspect
 import os
@@ -25,7 +25,7 @@ CALLS: Mapping[str, tuple[str, ...]] = {
     "label": ("flights", "out", "--method", "ekf"),
     "predict": ("dmrl-nano", "flights", "out"),
     "recover": ("flights", "out"),
-    "sketch": ("out", "--images", "250", "--seed", "4"),  # parts of a hundred
+    "sketch": ("out", "--images", "250", "--seed", "4"),  # three parts of at most 100 images
     "track": ("found", "out"),
     "trim": ("flights", "out", "--from", "2"),
 }
@@ -34,12 +34,12 @@ ELSEWHERE = {
     "render": "tests/stages/test_render.py",
     "calibrate": "tests/stages/test_calibrate_sensors.py",
 }
-"""Which tests do the same for a recipe, for Blender, and for flights that tell of their sensors."""
+"""Commands that need other inputs, and the file that tests them with several workers."""
 
 
 @pytest.fixture(scope="module")
-def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two flights, and what a network found in them."""
+def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder with two flights, and the detections of a network in them."""
     folder = tmp_path_factory.mktemp("place")
     (folder / "flights").mkdir()
     (folder / "found").mkdir()
@@ -66,16 +66,17 @@ def test_every_command_with_workers_is_tried() -> None:
 @pytest.mark.parametrize("command", CALLS)
 def test_any_number_of_workers_writes_the_same_bytes(
     command: str,
-    place: Path,
+    inputs: Path,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capfd: pytest.CaptureFixture[str],
 ) -> None:
-    monkeypatch.setattr(detection_report, "MIN_PARALLEL_DRAWS", 0)  # even for so few images
+    monkeypatch.setattr(detection_report, "MIN_PARALLEL_DRAWS", 0)  # parallel for few images too
     found = []
     numbers = ("1", "2")
-    for workers in numbers:  # links, all before the first run: `index` lists when a file changed
-        shutil.copytree(place, tmp_path / workers, copy_function=os.link)
+    # All links are made before the first run, since `index` lists when a file changed.
+    for workers in numbers:
+        shutil.copytree(inputs, tmp_path / workers, copy_function=os.link)
     for workers in numbers:
         folder = tmp_path / workers
         monkeypatch.chdir(folder)

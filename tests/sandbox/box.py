@@ -1,4 +1,4 @@
-"""A folder whose surroundings are watched, and hostile inputs for it."""
+"""Watch a folder for writes outside OUT, and write hostile inputs for the commands."""
 
 import hashlib
 import os
@@ -39,7 +39,7 @@ CHANGES += ("os.chmod", "os.system", "os.posix_spawn", "os.exec")
 
 
 class Box(NamedTuple):
-    """The folders of a test: where OUT goes, what is around it."""
+    """The folders of a test, as attributes: cwd, in, out, temp and victim below ``root``."""
 
     root: Path
 
@@ -50,23 +50,23 @@ class Box(NamedTuple):
 _watched: list[tuple[str, str]] | None = None
 
 
-def _hook(event: str, args: tuple[Any, ...]) -> None:
+def _record_event(event: str, args: tuple[Any, ...]) -> None:
     if _watched is None:
         return
     if event == "open" and isinstance(args[2], int) and args[2] & WRITES:
         _watched.append((event, os.fsdecode(args[0]) if not isinstance(args[0], int) else ""))
     elif event == "os.mkdir" and Path(os.fsdecode(args[0])).exists():
-        pass  # asked for in case it is not there
+        pass  # the folder exists, so nothing is made
     elif event in CHANGES and not (event in ("os.remove", "os.rmdir") and args[1] >= 0):
-        # Names within an open folder, as of a folder that is removed, the tree tells of.
+        # Removals relative to an open folder have no full path; the hashed tree shows them.
         _watched.extend((event, os.fsdecode(a)) for a in args[:2] if isinstance(a, str | bytes))
 
 
-sys.addaudithook(_hook)
+sys.addaudithook(_record_event)
 
 
-def _tree(root: Path) -> dict[str, str]:
-    """Every file and folder outside OUT and the temporary folder, with its content."""
+def _hash_tree(root: Path) -> dict[str, str]:
+    """Return the hash of every file and folder outside OUT and the temporary folder, by path."""
     found = {}
     for folder, folders, files in os.walk(root):
         at = Path(folder)
@@ -79,16 +79,16 @@ def _tree(root: Path) -> dict[str, str]:
 
 
 @contextmanager
-def untouched(box: Box) -> Iterator[None]:
-    """Nothing is written outside OUT and the temporary folder while the block lasts."""
+def assert_untouched(box: Box) -> Iterator[None]:
+    """Assert that the block writes nothing outside OUT and the temporary folder."""
     global _watched
-    before = _tree(box.root)
+    before = _hash_tree(box.root)
     _watched = []
     try:
         yield
     finally:
         seen, _watched = _watched, None
-    assert _tree(box.root) == before
+    assert _hash_tree(box.root) == before
     free = (box.out, box.temp, Path("/dev"), Path(sys.prefix), Path("/proc"))
     strange = [
         (event, path)
@@ -100,31 +100,34 @@ def untouched(box: Box) -> Iterator[None]:
     assert strange == []
 
 
-def run_in(box: Box, capsys: pytest.CaptureFixture[str], *words: object) -> int:
-    """Exit status of a command that touches nothing; it is 0, or 1 with one line."""
+def run_command(box: Box, capsys: pytest.CaptureFixture[str], *words: object) -> int:
+    """Run a command that must write nothing outside OUT; return its exit status.
+
+    Assert that the status is 0, or 1 with a one-line error.
+    """
     return run_and_capture(box, capsys, *words)[0]
 
 
 def run_and_capture(
     box: Box, capsys: pytest.CaptureFixture[str], *words: object
 ) -> tuple[int, str]:
-    """The same, and what it said on standard error."""
-    with untouched(box):
+    """Run a command as `run_command` does; return its exit status and standard error."""
+    with assert_untouched(box):
         status = boundary.run_to_status(lambda: app([str(word) for word in words]))
     output = capsys.readouterr()
     assert "internal error" not in output.err, output.err
     assert "\x1b" not in output.out + output.err
     assert status in (0, 1), output.err
     last = output.err.strip().splitlines()[-1:]
-    told = words[0] == "check" and not last  # what it found, on standard output
+    told = words[0] == "check" and not last  # check prints its findings on standard output
     assert status == 0 or told or last[0].startswith("dmrl: "), output.err
     return status, output.err
 
 
-def hostile(
+def write_hostile_recording(
     path: Path, split: dict[str, str] | None = None, robots: tuple[str, ...] = ROBOTS
 ) -> Path:
-    """A recording of robots, peers, sources, metadata and inputs with hostile names."""
+    """Write a recording of robots, peers, sources, metadata and inputs with hostile names."""
     made = Provenance(
         "predict\n# x",
         {"recipe": "../../victim/keep", "x": "`*/"},
@@ -172,8 +175,8 @@ def hostile(
     return path
 
 
-def quantised(folder: Path, network: IntegerNetwork) -> Path:
-    """A folder as ``dmrl quantize`` writes it, with this int8 network beside honest weights."""
+def write_quantized_model(folder: Path, network: IntegerNetwork) -> Path:
+    """Write a model folder as ``dmrl quantize`` does: valid weights, and this int8 network."""
     shutil.copytree(resolve_model_path(Path("dmrl-nano")), folder)
     save_network(network, folder / INTEGER_NAME)
     save_samples(np.zeros((1, network.height_px, network.width_px, 3), np.uint8), folder)
@@ -197,8 +200,8 @@ unit = "m"
 """
 
 
-def with_junk(path: Path, junk: str, calibration: dict[str, Any]) -> Path:
-    """A recording in which the messages of one topic are not what their schema says."""
+def write_junk_messages(path: Path, junk: str, calibration: dict[str, Any]) -> Path:
+    """Write a recording in which the messages of topic ``junk`` do not match their schema."""
     made = message_class("CameraCalibration")(width=64, height=48, **calibration)
     picture = encode_png(np.full((48, 64, 3), 99, np.uint8))
     peers = [{"peer": "cf2", "u_px": 20, "v_px": 20, "depth_m": 1.0, "source": "truth"}]

@@ -1,4 +1,4 @@
-"""A folder whose surroundings are watched, with every kind of untrusted input."""
+"""Fixtures: a watched folder, and every kind of untrusted input."""
 
 import shutil
 import tempfile
@@ -13,12 +13,21 @@ from dmrl.cli import app
 from dmrl.images.codec import encode_png
 
 from ..deploy.networks import random_network
-from .box import COLUMNS, CONTROLS, EACH, HOSTILE_TEXT, ROBOTS, Box, hostile, quantised
+from .box import (
+    COLUMNS,
+    CONTROLS,
+    EACH,
+    HOSTILE_TEXT,
+    ROBOTS,
+    Box,
+    write_hostile_recording,
+    write_quantized_model,
+)
 
 
 @pytest.fixture
 def box(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Box:
-    """A folder to work in, a victim beside it, and OUT."""
+    """Make the folders of a test: a working folder, inputs, OUT, and a victim beside them."""
     root = tmp_path.resolve()
     for name in ("cwd", "in", "out", "temp", "victim"):
         (root / name).mkdir()
@@ -33,10 +42,10 @@ def box(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Box:
 
 @pytest.fixture(scope="module", params=[ROBOTS, CONTROLS], ids=["names", "controls"])
 def inputs(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder of everything a stranger can give, and a dataset made of it."""
+    """Return a folder with every kind of untrusted input, and a dataset made of them."""
     root = tmp_path_factory.mktemp("hostile")
-    bad = hostile(root / "bad.mcap", robots=request.param)
-    hostile(root / "other.mcap", {"x": "[[0, 1]]"}, request.param)
+    bad = write_hostile_recording(root / "bad.mcap", robots=request.param)
+    write_hostile_recording(root / "other.mcap", {"x": "[[0, 1]]"}, request.param)
     (root / "each.toml").write_text(EACH)
     (root / "columns.toml").write_text(COLUMNS)
     for name in ("logs", "pictures", "folder"):
@@ -52,8 +61,8 @@ def inputs(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
         for k, layer in enumerate(random_network(0).layers)
     )
     named = replace(random_network(0), name=HOSTILE_TEXT, architecture=HOSTILE_TEXT, layers=layers)
-    quantised(root / "model", named)
-    source = bad if request.param is ROBOTS else hostile(root / "named.mcap")
+    write_quantized_model(root / "model", named)
+    source = bad if request.param is ROBOTS else write_hostile_recording(root / "named.mcap")
     made = ["dataset", str(source), str(root / "cards"), "--split", "recordings"]
     assert boundary.run_to_status(lambda: app(made)) == 0
     return root

@@ -1,7 +1,6 @@
-"""Hostile inputs to every command: nothing is written but OUT and temporary files.
+"""With hostile inputs, every command writes only OUT and temporary files.
 
-Whatever the command says, the tree around it is the same before and after, and Python's own
-trace of file accesses holds no write outside OUT.
+The tree around OUT is the same before and after, and Python's audit events show no other write.
 """
 
 import shutil
@@ -11,7 +10,7 @@ import pytest
 
 from dmrl.cli import COMMANDS
 
-from .box import EACH, Box, run_in
+from .box import EACH, Box, run_command
 
 pytestmark = pytest.mark.heavy
 
@@ -71,7 +70,7 @@ HOSTILE: dict[str, tuple[tuple[str, ...], ...]] = {
         ("IN/link", "OUT/trimmed2.mcap"),
     ),
 }
-"""What every command is given: inputs full of hostile names, links to what is not theirs."""
+"""Arguments of every command: inputs with hostile names, and links to the victim's files."""
 
 
 def test_every_command_is_given_hostile_inputs() -> None:
@@ -95,7 +94,7 @@ def test_no_command_writes_elsewhere_for_hostile_inputs(
             else w
             for w in words
         ]
-        run_in(box, capsys, name, *given)
+        run_command(box, capsys, name, *given)
     pages = [
         p.read_text()
         for p in (box.out / "page.html", box.out / "cards" / "report.html")
@@ -145,7 +144,7 @@ def test_links_in_out_are_not_written_through(
         path.symlink_to(box.root / target)
         if words[0] == "run":
             (path.parent / "pipeline.json").write_text('{"begun": {}, "done": {}, "hashes": {}}')
-        run_in(box, capsys, *given)
+        run_command(box, capsys, *given)
         if path.is_symlink():
             path.unlink()
 
@@ -158,7 +157,7 @@ def test_a_recipe_s_step_writes_in_the_pipeline_s_folder(
     recipe = box.root / "in" / "recipe.toml"
     step = '[[step]]\nstage = "sketch"\nimages = 1\nout = '
     recipe.write_text(f'kind = "pipeline"\n{step}"{out}"\n')
-    assert run_in(box, capsys, "run", recipe, "--out", box.out / "a") == 1
+    assert run_command(box, capsys, "run", recipe, "--out", box.out / "a") == 1
     assert list(box.out.iterdir()) == []
     recipe.write_text(f'kind = "pipeline"\n{step}"honest"\n')
-    assert run_in(box, capsys, "run", recipe, "--out", box.out / "a") == 0  # so it is the name
+    assert run_command(box, capsys, "run", recipe, "--out", box.out / "a") == 0  # so it is the name

@@ -1,4 +1,4 @@
-"""Names and numbers in untrusted datasets and models: no path, code or NaN comes of them."""
+"""Names and numbers in untrusted datasets and models become no path, code or NaN."""
 
 import json
 import shutil
@@ -19,11 +19,11 @@ from .box import (
     ELSEWHERE,
     HOSTILE_TEXT,
     Box,
-    hostile,
-    quantised,
+    assert_untouched,
     run_and_capture,
-    run_in,
-    untouched,
+    run_command,
+    write_hostile_recording,
+    write_quantized_model,
 )
 
 
@@ -34,10 +34,10 @@ def test_a_split_of_a_recording_stays_in_the_dataset(
     split: str, box: Box, capsys: pytest.CaptureFixture[str]
 ) -> None:
     name = split.replace("{victim}", str(box.victim))
-    bad = hostile(box.root / "in" / "bad.mcap", {name: "[[0, 900000000]]"})
+    bad = write_hostile_recording(box.root / "in" / "bad.mcap", {name: "[[0, 900000000]]"})
     for extra in ((), ("--parquet",)):
         for mode in ("auto", "recordings"):
-            run_in(
+            run_command(
                 box,
                 capsys,
                 "dataset",
@@ -52,11 +52,11 @@ def test_a_split_of_a_recording_stays_in_the_dataset(
 
 @pytest.mark.parametrize("extra", [(), ("--parquet",)], ids=["arrow", "parquet"])
 @pytest.mark.heavy
-def test_two_splits_that_a_disk_takes_for_one_are_refused(
+def test_splits_whose_folders_would_coincide_are_refused(
     extra: tuple[str, ...], box: Box, capsys: pytest.CaptureFixture[str]
 ) -> None:
     halves = {"near": "[[0, 100000001]]", "Near": "[[200000000, 900000000]]"}
-    bad = hostile(box.root / "in" / "bad.mcap", halves, ("cf1",))
+    bad = write_hostile_recording(box.root / "in" / "bad.mcap", halves, ("cf1",))
     words = ("dataset", bad, box.out / "set", "--split", "auto", *extra)
     status, output = run_and_capture(box, capsys, *words)
     assert status == 1 and "the splits near and Near differ only in case" in output
@@ -76,10 +76,10 @@ def test_a_split_of_a_label_table_stays_in_the_dataset(
     rows = f'file,peer,u_px,v_px,depth_m,split\n000000000000.png,cf2,3,4,1,"{name}"\n'
     (folder / "labels.csv").write_text(rows)
     out = box.out / "x.mcap"
-    status = run_in(box, capsys, "convert", folder, out, "--from", "images")
+    status = run_command(box, capsys, "convert", folder, out, "--from", "images")
     assert (status == 0) == (name in ("", "-rf"))
     if status == 0:
-        run_in(box, capsys, "dataset", out, box.out / "set", "--split", "auto")
+        run_command(box, capsys, "dataset", out, box.out / "set", "--split", "auto")
 
 
 @pytest.mark.usefixtures("empty_figures")
@@ -87,9 +87,9 @@ def test_a_split_of_a_label_table_stays_in_the_dataset(
 def test_a_hostile_dataset_is_read_and_carded_where_it_is(
     box: Box, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    bad = hostile(box.root / "in" / "bad.mcap")
+    bad = write_hostile_recording(box.root / "in" / "bad.mcap")
     good = box.out / "set"
-    assert run_in(box, capsys, "dataset", bad, good, "--split", "recordings") == 0
+    assert run_command(box, capsys, "dataset", bad, good, "--split", "recordings") == 0
     card = (good / "README.md").read_text()
     assert "<img" not in card.replace("`", "")
     assert "\n# x" not in card
@@ -124,23 +124,25 @@ def test_a_hostile_dataset_is_read_and_carded_where_it_is(
         shutil.copytree(good, hurt)
         (hurt / "figures").mkdir(exist_ok=True)
         edit(hurt)
-        run_in(box, capsys, "card", hurt)
-        run_in(box, capsys, "train", hurt, box.out / "run", "--epochs", "1", "--batch-size", "0")
+        run_command(box, capsys, "card", hurt)
+        run_command(
+            box, capsys, "train", hurt, box.out / "run", "--epochs", "1", "--batch-size", "0"
+        )
         shutil.rmtree(hurt)
 
 
-def arrays_of(box: Box) -> tuple[Path, dict[str, Any]]:
-    """An honest quantised model, and what its int8 network holds."""
-    folder = quantised(box.root / "in" / "model", random_network(0))
+def build_model_arrays(box: Box) -> tuple[Path, dict[str, Any]]:
+    """Write a valid quantized model; return its folder and the arrays of its int8 network."""
+    folder = write_quantized_model(box.root / "in" / "model", random_network(0))
     with np.load(folder / INTEGER_NAME) as archive:
         return folder, {name: archive[name] for name in archive.files}
 
 
-def refused_by_export(box: Box, capsys: pytest.CaptureFixture[str]) -> None:
-    """It is the int8 network that is refused, not what lies beside it."""
+def assert_export_refuses(box: Box, capsys: pytest.CaptureFixture[str]) -> None:
+    """Assert that export refuses the model's int8 network and writes nothing."""
     folder = box.root / "in" / "model"
     words = ["export", str(folder), str(box.out / "x")]
-    with untouched(box):
+    with assert_untouched(box):
         assert boundary.run_to_status(lambda: app(words)) == 1
     output = capsys.readouterr().err
     assert "internal error" not in output
@@ -155,14 +157,14 @@ def test_a_model_s_names_do_not_become_code(box: Box, capsys: pytest.CaptureFixt
         replace(layer, name=f"{HOSTILE_TEXT}{k}") for k, layer in enumerate(network.layers)
     )
     bad = replace(network, name=HOSTILE_TEXT, architecture=HOSTILE_TEXT, layers=layers)
-    folder, written = quantised(box.root / "in" / "model", bad), box.out / "exported"
-    assert run_in(box, capsys, "export", folder, written) == 0
+    folder, written = write_quantized_model(box.root / "in" / "model", bad), box.out / "exported"
+    assert run_command(box, capsys, "export", folder, written) == 0
     for words in (
         ("verify", folder),
         ("predict", folder, folder, box.out / "x.mcap"),
         ("quantize", folder, folder, box.out / "q"),
     ):
-        run_in(box, capsys, *words)
+        run_command(box, capsys, *words)
     texts = [path.read_text() for path in written.iterdir() if path.suffix in (".c", ".h", "")]
     assert len(texts) > 3
     assert not any("/etc/passwd" in text or "$(shell touch" in text for text in texts)
@@ -183,14 +185,14 @@ def test_a_model_s_names_do_not_become_code(box: Box, capsys: pytest.CaptureFixt
         (("heads", "confidence", "channel"), "0"),
         (("layers",), 7),
         (("layers", 0), None),
-        (("layers", 0, "name"), "conv1"),  # as another is called
+        (("layers", 0, "name"), "conv1"),  # the name of another layer
         (("heads",), []),
     ],
 )
 def test_a_model_s_numbers_are_numbers(
     path: tuple[Any, ...], value: Any, box: Box, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    folder, arrays = arrays_of(box)
+    folder, arrays = build_model_arrays(box)
     said = json.loads(arrays.pop("description").tobytes())
     place = said
     for step in path[:-1]:
@@ -198,7 +200,7 @@ def test_a_model_s_numbers_are_numbers(
     place[path[-1]] = value
     text = np.frombuffer(json.dumps(said).encode(), np.uint8)
     np.savez(folder / INTEGER_NAME, description=text, **arrays)
-    refused_by_export(box, capsys)
+    assert_export_refuses(box, capsys)
 
 
 @pytest.mark.parametrize("name", ["layer0.bias", "layer0.multiplier"])
@@ -206,6 +208,6 @@ def test_a_model_s_numbers_are_numbers(
 def test_a_model_has_a_number_for_each_channel(
     name: str, size: int, box: Box, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    folder, arrays = arrays_of(box)
+    folder, arrays = build_model_arrays(box)
     np.savez(folder / INTEGER_NAME, **arrays | {name: arrays[name][:size]})
-    refused_by_export(box, capsys)
+    assert_export_refuses(box, capsys)

@@ -1,4 +1,4 @@
-"""Damaged inputs to every command: a one-line error, and no partial output."""
+"""Damaged inputs give a one-line error from every command, and no partial output."""
 
 import os
 from typing import Any
@@ -8,12 +8,12 @@ import pytest
 from dmrl import boundary
 from dmrl.cli import COMMANDS, app
 
-from .box import Box, run_in, with_junk
+from .box import Box, run_command, write_junk_messages
 
 pytestmark = pytest.mark.heavy
 
 
-# doctor reads none; index writes into the folder, and what cannot be read is a row of its own
+# doctor reads no input; index writes into the folder and lists unreadable files as rows.
 @pytest.mark.parametrize("name", [name for name in COMMANDS if name not in ("doctor", "index")])
 def test_every_command_takes_damaged_inputs_as_errors(
     name: str, box: Box, capsys: pytest.CaptureFixture[str]
@@ -52,7 +52,7 @@ def test_every_command_takes_damaged_inputs_as_errors(
     for file in [*deep, "."]:
         given = str(box.root / "in" / file)
         words = [w.replace("IN", given).replace("OUT", str(box.out / "x")) for w in pattern]
-        assert run_in(box, capsys, *words) == 1
+        assert run_command(box, capsys, *words) == 1
     assert list(box.out.iterdir()) == []
 
 
@@ -73,7 +73,7 @@ def test_every_command_takes_damaged_inputs_as_errors(
 def test_undecodable_messages_give_one_line_errors(
     junk: str, calibration: dict[str, Any], box: Box, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    bad, out = with_junk(box.root / "in" / "bad.mcap", junk, calibration), box.out
+    bad, out = write_junk_messages(box.root / "in" / "bad.mcap", junk, calibration), box.out
     for words in (
         ("info", bad),
         ("check", bad),
@@ -88,15 +88,15 @@ def test_undecodable_messages_give_one_line_errors(
         ("evaluate", bad),
         ("view", bad, "--save", out / "view.rrd"),
     ):
-        run_in(box, capsys, *words)
+        run_command(box, capsys, *words)
 
 
 @pytest.mark.usefixtures("empty_figures")
 def test_input_changed_during_the_run_gives_one_line_error(
     box: Box, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    path = with_junk(box.root / "in" / "flight.mcap", "", {})
-    other = with_junk(box.root / "temp" / "other.mcap", "labels", {})
+    path = write_junk_messages(box.root / "in" / "flight.mcap", "", {})
+    other = write_junk_messages(box.root / "temp" / "other.mcap", "labels", {})
 
     def replace_it(*_: object) -> None:
         other.replace(path)
@@ -109,7 +109,7 @@ def test_input_changed_during_the_run_gives_one_line_error(
 
 
 def test_non_utf_8_name_gives_one_line_error(box: Box, capsys: pytest.CaptureFixture[str]) -> None:
-    made = with_junk(box.root / "in" / "a.mcap", "", {})
+    made = write_junk_messages(box.root / "in" / "a.mcap", "", {})
     flight = made.rename(made.with_name(os.fsdecode(b"\xff.mcap")))
     for words in (
         ("info", flight),
@@ -125,13 +125,13 @@ def test_non_utf_8_name_gives_one_line_error(box: Box, capsys: pytest.CaptureFix
         ("report", box.root / "in", box.out / "page.html"),
         ("dataset", flight, box.out / "set"),
     ):
-        run_in(box, capsys, *words)
+        run_command(box, capsys, *words)
 
 
 def test_pipe_in_place_of_a_file_gives_one_line_error(
     box: Box, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Opening it would wait for somebody who writes."""
+    """Opening a pipe would wait for a writer for ever."""
     pipe, folder = box.root / "in" / "x.mcap", box.root / "in"
     for name in ("x.mcap", "x.h5", "model.json", "x.csv", "x.png", "labels.csv"):
         os.mkfifo(folder / name)
@@ -149,4 +149,4 @@ def test_pipe_in_place_of_a_file_gives_one_line_error(
         ("train", folder, box.out / "run"),
         ("report", folder, box.out / "page.html"),
     ):
-        assert run_in(box, capsys, *words) == 1
+        assert run_command(box, capsys, *words) == 1

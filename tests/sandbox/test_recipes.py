@@ -11,7 +11,7 @@ from dmrl import recipe
 from dmrl.images.codec import encode_png
 from dmrl.stages import fly, render, train
 
-from .box import Box, hostile, run_and_capture
+from .box import Box, run_and_capture, write_hostile_recording
 
 COMMANDS = {
     "run": ("run", "TOML", "--out", "OUT/run"),
@@ -44,9 +44,9 @@ TEXTS = {
 
 
 @pytest.fixture
-def given(box: Box) -> Box:
-    """A folder with what the commands want beside the TOML."""
-    hostile(box.root / "in" / "a.mcap", robots=("cf1",))
+def box_with_inputs(box: Box) -> Box:
+    """Return the box with the other inputs that the commands need."""
+    write_hostile_recording(box.root / "in" / "a.mcap", robots=("cf1",))
     for name in ("logs", "pictures"):
         (box.root / "in" / name).mkdir()
     (box.root / "in" / "logs" / "cf1.csv").write_text("t,h\n0,1\n1,2\n")
@@ -61,19 +61,23 @@ def given(box: Box) -> Box:
 )
 @pytest.mark.heavy
 def test_hostile_toml_is_one_line_that_names_it(
-    command: str, given: Box, capsys: pytest.CaptureFixture[str]
+    command: str, box_with_inputs: Box, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    path = given.root / "in" / "strange.toml"
-    places = {"TOML": str(path), "IN": str(given.root / "in"), "OUT": str(given.out)}
+    path = box_with_inputs.root / "in" / "strange.toml"
+    places = {
+        "TOML": str(path),
+        "IN": str(box_with_inputs.root / "in"),
+        "OUT": str(box_with_inputs.out),
+    }
     words = [
         places.get(first := w.split("/")[0], first) + w[len(first) :] for w in COMMANDS[command]
     ]
     for name, text in TEXTS.items():
         path.write_bytes(text.encode("utf-8", "surrogateescape"))
-        status, output = run_and_capture(given, capsys, *words)
+        status, output = run_and_capture(box_with_inputs, capsys, *words)
         assert (status, output.count("\n")) == (1, 1), (name, output)
         assert "strange.toml" in output and len(output) < 600, (name, output)
-        assert list(given.out.iterdir()) == [], name
+        assert list(box_with_inputs.out.iterdir()) == [], name
 
 
 VALUES: tuple[Any, ...] = (
@@ -87,7 +91,7 @@ VALUES: tuple[Any, ...] = (
 def test_every_setting_is_right_or_refused_in_one_line(
     kind: str,
 ) -> None:
-    """Of any kind and size; what is not a finite number is no number of any setting."""
+    """Values of any type and size are tried; numbers that are not finite are always refused."""
     settings = {"render": render, "fly": fly, "train": train}[kind].Settings
     for field in fields(settings):
         for value in VALUES:

@@ -1,6 +1,6 @@
-"""Recordings on two local Ray nodes: the same bytes as in one process, even if a node dies.
+"""Two local Ray nodes give the same bytes as one process, even if a node dies.
 
-Ray is told to stay on loopback, and has no dashboard.
+Ray stays on the loopback interface and has no dashboard.
 """
 
 import os
@@ -24,27 +24,27 @@ from dmrl.pipeline.job import build_job
 from dmrl.pipeline.single_run import run_on_cluster
 from dmrl.stages import dataset, fly, trim
 
-from ..test_batch import bytes_in, record
+from ..test_batch import read_files, write_recording
 
 pytestmark = [
     pytest.mark.slow,
-    pytest.mark.timeout(1800),  # minutes, on a machine that is busy
-    pytest.mark.filterwarnings("ignore"),  # Ray's own
+    pytest.mark.timeout(1800),  # seconds, enough for a busy machine
+    pytest.mark.filterwarnings("ignore"),  # warnings from Ray
 ]
 SETTINGS = {
-    "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0",  # else it advertises the machine's own address
+    "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0",  # otherwise Ray uses the machine's external address
     "RAY_USAGE_STATS_ENABLED": "0",
     "RAY_enable_metrics_collection": "0",
 }
-os.environ.update(SETTINGS)  # Ray reads them when it is loaded
+os.environ.update(SETTINGS)  # Ray reads them on import
 NODE = {"num_cpus": 1, "object_store_memory": 80_000_000, "node_ip_address": "127.0.0.1"}
 NODE |= {"include_dashboard": False, "include_log_monitor": False, "no_monitor": True}
-KEPT = trim.Settings(to_s=1.5)
+TRIM_SETTINGS = trim.Settings(to_s=1.5)
 COUNT = 40
 
 
 class Nodes:
-    """A head and another node, which can die."""
+    """A head node, and another node that tests can kill."""
 
     def __init__(self) -> None:
         from ray.cluster_utils import Cluster  # noqa: PLC0415 - reads the environment
@@ -52,19 +52,20 @@ class Nodes:
         self.cluster = Cluster(initialize_head=True, head_node_args=dict(NODE))
         self.other: Any = self.cluster.add_node(**NODE)
 
-    def die(self) -> None:
-        """Kill the other node, at once."""
+    def kill_node(self) -> None:
+        """Kill the other node."""
         self.cluster.remove_node(self.other, allow_graceful=False)
         self.other = None
 
-    def whole(self) -> None:
-        """Bring it back."""
+    def restore_node(self) -> None:
+        """Start the other node again if it was killed."""
         if self.other is None:
             self.other = self.cluster.add_node(**NODE)
 
 
 @pytest.fixture(scope="module")
 def nodes() -> Iterator[Nodes]:
+    """Start two nodes and set RAY_ADDRESS."""
     with pytest.MonkeyPatch.context() as patch:
         found = Nodes()
         patch.setenv("RAY_ADDRESS", found.cluster.address)
@@ -74,37 +75,38 @@ def nodes() -> Iterator[Nodes]:
 
 @pytest.fixture(scope="module")
 def flights(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder with `COUNT` recordings of different lengths."""
     folder = tmp_path_factory.mktemp("cluster") / "flights"
     for k in range(COUNT):
-        record(folder / f"{k % 4}" / f"{k:02d}.mcap", messages=20 + k, roll_rad=k)
+        write_recording(folder / f"{k % 4}" / f"{k:02d}.mcap", messages=20 + k, roll_rad=k)
     return folder
 
 
 @pytest.fixture(scope="module")
-def alone(flights: Path) -> dict[str, bytes]:
-    """What one process here makes of them."""
+def local_outputs(flights: Path) -> dict[str, bytes]:
+    """Trim the flights in one local process and return the bytes of the outputs."""
     out = flights.parent / "alone"
-    run_over_folder("trim", flights, out, KEPT, workers=1)
-    return bytes_in(out)
+    run_over_folder("trim", flights, out, TRIM_SETTINGS, workers=1)
+    return read_files(out)
 
 
 def test_ray_outputs_equal_local_outputs_and_nodes_are_listed(
-    nodes: Nodes, flights: Path, alone: dict[str, bytes], tmp_path: Path, capfd: Any
+    nodes: Nodes, flights: Path, local_outputs: dict[str, bytes], tmp_path: Path, capfd: Any
 ) -> None:
-    run_over_folder("trim", flights, tmp_path / "out", KEPT, workers=None, on="ray")
-    assert bytes_in(tmp_path / "out") == alone
+    run_over_folder("trim", flights, tmp_path / "out", TRIM_SETTINGS, workers=None, on="ray")
+    assert read_files(tmp_path / "out") == local_outputs
     told = [line for line in capfd.readouterr().err.splitlines() if line.startswith("node ")]
     assert len(told) == 2 and all(" 0 failed" in line for line in told)
     (tmp_path / "out" / "0" / "00.mcap").unlink()
-    run_over_folder("trim", flights, tmp_path / "out", KEPT, workers=None, on="ray")
-    assert bytes_in(tmp_path / "out") == alone
+    run_over_folder("trim", flights, tmp_path / "out", TRIM_SETTINGS, workers=None, on="ray")
+    assert read_files(tmp_path / "out") == local_outputs
     assert capfd.readouterr().out.count("was there") == COUNT - 1
 
 
-def test_names_that_a_shell_or_a_line_would_read_otherwise_are_names(
+def test_recordings_with_special_characters_in_their_names_are_processed(
     nodes: Nodes, tmp_path: Path
 ) -> None:
-    nodes.whole()
+    nodes.restore_node()
     names = {
         "$(touch victim).mcap",
         "a'b\"c.mcap",
@@ -113,39 +115,39 @@ def test_names_that_a_shell_or_a_line_would_read_otherwise_are_names(
         "\u2028;touch victim.mcap",
     }
     for k, name in enumerate(sorted(names)):
-        record(tmp_path / "it's $(touch victim)\n" / name, roll_rad=k)
+        write_recording(tmp_path / "it's $(touch victim)\n" / name, roll_rad=k)
     source, out = tmp_path / "it's $(touch victim)\n", tmp_path / "-out\n"
-    run_over_folder("trim", source, out, KEPT, workers=None, on="ray")
+    run_over_folder("trim", source, out, TRIM_SETTINGS, workers=None, on="ray")
     assert {path.name for path in out.glob("*.mcap")} == names
-    run_over_folder("trim", source, tmp_path / "here", KEPT, workers=1)
-    assert bytes_in(out) == bytes_in(tmp_path / "here")
+    run_over_folder("trim", source, tmp_path / "here", TRIM_SETTINGS, workers=1)
+    assert read_files(out) == read_files(tmp_path / "here")
     assert not list(tmp_path.rglob("victim")) and not Path("victim").exists()
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_a_node_that_dies_at_any_moment_loses_nothing(
-    seed: int, nodes: Nodes, flights: Path, alone: dict[str, bytes], tmp_path: Path
+    seed: int, nodes: Nodes, flights: Path, local_outputs: dict[str, bytes], tmp_path: Path
 ) -> None:
-    nodes.whole()
+    nodes.restore_node()
     out = tmp_path / "out"
     after = random.Random(seed).randrange(COUNT - 10)
 
     def kill() -> None:
         while len(list(out.rglob("*.mcap"))) <= after:
             time.sleep(0.01)
-        nodes.die()
+        nodes.kill_node()
 
     killer = threading.Thread(target=kill)
     killer.start()
-    run_over_folder("trim", flights, out, KEPT, workers=None, on="ray")
+    run_over_folder("trim", flights, out, TRIM_SETTINGS, workers=None, on="ray")
     killer.join()
     assert nodes.other is None
-    assert bytes_in(out) == alone
+    assert read_files(out) == local_outputs
 
 
 @pytest.fixture(scope="module")
-def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Forty short flights with all their sensors and pictures: eight, each cut five times."""
+def sensor_flights(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder with 40 flights with sensors and images: 8, each trimmed to 5 lengths."""
     folder = tmp_path_factory.mktemp("flown")
     for seed in range(8):
         whole = folder / f"{seed}.mcap"
@@ -160,47 +162,47 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def labelled(flown: Path) -> Path:
-    """What one process here makes of them."""
-    run_over_folder("label", flown, flown.parent / "labelled", workers=1)
-    return flown.parent / "labelled"
+def local_labels(sensor_flights: Path) -> Path:
+    """Label the flights in one local process and return the folder of the outputs."""
+    run_over_folder("label", sensor_flights, sensor_flights.parent / "labelled", workers=1)
+    return sensor_flights.parent / "labelled"
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_labels_equal_one_process_even_if_a_node_dies(
-    seed: int, nodes: Nodes, flown: Path, labelled: Path, tmp_path: Path
+    seed: int, nodes: Nodes, sensor_flights: Path, local_labels: Path, tmp_path: Path
 ) -> None:
-    nodes.whole()
+    nodes.restore_node()
     out = tmp_path / "out"
     killer = threading.Thread(target=_kill_after, args=(nodes, out, seed))
     killer.start()
-    run_over_folder("label", flown, out, workers=None, on="ray")
+    run_over_folder("label", sensor_flights, out, workers=None, on="ray")
     killer.join()
     assert nodes.other is None
-    assert bytes_in(out) == bytes_in(labelled) and len(bytes_in(out)) == COUNT
+    assert read_files(out) == read_files(local_labels) and len(read_files(out)) == COUNT
 
 
 def _kill_after(nodes: Nodes, out: Path, seed: int) -> None:
     after = random.Random(seed).randrange(COUNT - 10)
     while len(list(out.rglob("*.mcap"))) <= after:
         time.sleep(0.01)
-    nodes.die()
+    nodes.kill_node()
 
 
-def test_ray_dataset_equals_local_dataset(nodes: Nodes, labelled: Path, tmp_path: Path) -> None:
-    nodes.whole()
-    given, how = sorted(labelled.glob("*.mcap")), dataset.Settings(keep_all=True)
+def test_ray_dataset_equals_local_dataset(nodes: Nodes, local_labels: Path, tmp_path: Path) -> None:
+    nodes.restore_node()
+    given, how = sorted(local_labels.glob("*.mcap")), dataset.Settings(keep_all=True)
     dataset.run(given, tmp_path / "here", how, workers=1)
     told = run_on_cluster("ray", "dataset", tmp_path / "there", {"recordings": given}, how)
     assert told is not None and sum(told["images"].values()) >= COUNT
-    assert bytes_in(tmp_path / "there") == bytes_in(tmp_path / "here")
+    assert read_files(tmp_path / "there") == read_files(tmp_path / "here")
     assert run_on_cluster("ray", "dataset", tmp_path / "there", {"recordings": given}, how) is None
 
 
 def test_node_table_counts_jobs_and_marks_lost_nodes(
     nodes: Nodes, flights: Path, tmp_path: Path, capfd: Any
 ) -> None:
-    nodes.whole()
+    nodes.restore_node()
     with open_executor("ray", None) as crew:
         assert (
             crew.list_nodes()[0][0] == "node"
@@ -213,7 +215,7 @@ def test_node_table_counts_jobs_and_marks_lost_nodes(
         for future in [crew.submit(line, exclusive=False) for line in lines]:
             assert "error" not in future.result()
         assert sum(int(str(row[2])) for row in crew.list_nodes()[1:]) == 6
-        nodes.die()
+        nodes.kill_node()
         until_s = time.monotonic() + 30
         while "lost" not in {row[1] for row in crew.list_nodes()} and time.monotonic() < until_s:
             time.sleep(0.2)
@@ -222,8 +224,8 @@ def test_node_table_counts_jobs_and_marks_lost_nodes(
 
 
 def test_job_that_fails_on_one_node_is_retried_elsewhere(nodes: Nodes, tmp_path: Path) -> None:
-    """A full disk is one node's: the answer says that another may do it."""
-    nodes.whole()
+    """After an error of one node, such as a full disk, another node tries the job."""
+    nodes.restore_node()
     with open_executor("ray", None) as crew:
         run_once = crew._run_once  # type: ignore[attr-defined]
         seen: list[str] = []
@@ -236,7 +238,7 @@ def test_job_that_fails_on_one_node_is_retried_elsewhere(nodes: Nodes, tmp_path:
             return {"result": 1, "node": seen[1]}
 
         crew._run_once = watched  # type: ignore[attr-defined]
-        source = record(tmp_path / "a.mcap")
+        source = write_recording(tmp_path / "a.mcap")
         line = build_job(
             "trim", tmp_path / "b.mcap", {"recording": source}, {"to_s": 1.0}, keep=True
         )
@@ -252,8 +254,8 @@ def test_failing_recording_does_not_stop_the_others(
     shutil.copytree(flights / "0", few)
     (few / "torn.mcap").write_bytes(b"no recording")
     with pytest.raises(DmrlError, match="1 of 11 recordings failed"):
-        run_over_folder("trim", few, tmp_path / "out", KEPT, workers=None, on="ray")
-    assert len(bytes_in(tmp_path / "out")) == 10
+        run_over_folder("trim", few, tmp_path / "out", TRIM_SETTINGS, workers=None, on="ray")
+    assert len(read_files(tmp_path / "out")) == 10
 
 
 def test_other_versions_and_wrong_addresses_give_one_line_errors(
@@ -283,9 +285,9 @@ def test_ctrl_c_ends_the_tasks(nodes: Nodes, flights: Path, tmp_path: Path) -> N
     process.send_signal(signal.SIGINT)
     _, output = process.communicate(timeout=120)
     assert process.returncode == 130 and "stopped." in output
-    made = bytes_in(out)
+    made = read_files(out)
     time.sleep(2.0)
-    assert bytes_in(out) == made
+    assert read_files(out) == made
     assert not [name for name in made if name.endswith(".partial")]
 
 
