@@ -59,7 +59,7 @@ def check_types(layout: Path, program: str) -> tuple[int, str]:
 
 @pytest.mark.slow
 @pytest.mark.timeout(3000)
-def test_a_client_is_typed(layout: Path) -> None:
+def test_mypy_accepts_a_correct_client_and_finds_a_wrong_attribute(layout: Path) -> None:
     assert check_types(layout, CLIENT) == (0, "Success: no issues found in 1 source file\n")
     wrong = CLIENT.replace("found[0][0].depth_m", "found[0][0].depth")
     status, said = check_types(layout, wrong)

@@ -71,7 +71,7 @@ def test_missing_dataset_or_split_is_reported(data: Path, tmp_path: Path) -> Non
     assert dmrl.dataset(data).card().startswith("---")
 
 
-def test_empty_and_odd_choices_of_rows(data: Path) -> None:
+def test_empty_choices_of_rows_are_allowed_and_invalid_ones_refused(data: Path) -> None:
     rows = dmrl.dataset(data)["train"]
     assert rows[5:5]["image"].shape == (0, 224, 320, 3)
     assert rows.gathered([])["depth"].shape == (0, 28, 40)

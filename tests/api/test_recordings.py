@@ -93,7 +93,7 @@ def test_missing_topic_or_recording_is_reported(flight: Path, tmp_path: Path) ->
         dmrl.open(tmp_path / "none.mcap")
 
 
-def test_html_of_names_that_are_markup(tmp_path: Path) -> None:
+def test_names_are_escaped_in_html(tmp_path: Path) -> None:
     with dmrl.writer(tmp_path / "odd.mcap") as out:
         out.write("/<b>/height", 0.0, {"height_m": 1.0})
     html = dmrl.open(tmp_path / "odd.mcap")._repr_html_()

@@ -176,14 +176,14 @@ GRID = "/a/detections/grid"
         (lambda out: out.write("/a/labels", 0, {"peers": [{"u_px": None}]}), "u_px has no value"),
     ],
 )
-def test_values_that_are_none_are_reported(
+def test_invalid_values_are_reported_on_writing(
     tmp_path: Path, write: Callable[[Any], None], error: str
 ) -> None:
     with dmrl.writer(tmp_path / "own.mcap") as out, pytest.raises(DmrlError, match=error):
         write(out)
 
 
-def test_lists_of_unlike_lengths_and_named_cameras_are_written(tmp_path: Path) -> None:
+def test_lists_of_different_lengths_and_named_cameras_are_written(tmp_path: Path) -> None:
     with dmrl.writer(tmp_path / "own.mcap") as out:
         out.write_columns("/a/labels", [0.0, 0.1], {"sources": [["truth"], ["truth", "hand"]]})
         out.camera("a", "aideck")
@@ -192,7 +192,7 @@ def test_lists_of_unlike_lengths_and_named_cameras_are_written(tmp_path: Path) -
     assert rec["/a/camera/calibration"].to_arrow()["width"].to_pylist() == [320]
 
 
-def test_texts_and_bytes_of_columns_keep_zeros_at_their_end(tmp_path: Path) -> None:
+def test_texts_and_bytes_of_columns_keep_trailing_zeros(tmp_path: Path) -> None:
     data = [b"a\0\0", b"\0\0\0\0"]
     with dmrl.writer(tmp_path / "own.mcap") as out:
         for channels in ([["x"], ["y\0"]], [["x"], ["y", "z\0"]]):

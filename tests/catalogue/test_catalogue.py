@@ -160,7 +160,7 @@ def test_invalid_query_gives_one_line_error_and_reads_no_other_file(
     assert [path.name for path in tmp_path.iterdir()] == ["a.csv"]
 
 
-def test_a_misspelt_column_is_named_with_the_nearest(tmp_path: Path) -> None:
+def test_misspelt_column_error_suggests_the_nearest_name(tmp_path: Path) -> None:
     with pytest.raises(SettingError, match=r"no column image\. Did you mean images\? Columns:"):
         find_rows(Catalogue(tmp_path, to_table([])), "image > 3")
 

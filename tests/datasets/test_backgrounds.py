@@ -16,7 +16,7 @@ BOX = {"box_px": [16.0, 9.0, 25.0, 16.0]}
 
 
 @pytest.mark.heavy
-def test_robots_of_a_dataset_are_painted_over(record: Record, tmp_path: Path) -> None:
+def test_robots_of_a_dataset_are_inpainted(record: Record, tmp_path: Path) -> None:
     filling = build_peer(box_px=[0.0, 0.0, 64.0, 48.0])
     recording = record(peers=[[build_peer(**BOX)], [], [filling], [build_peer()]])
     dataset.run([recording], tmp_path / "set", dataset.Settings())

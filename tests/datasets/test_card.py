@@ -106,7 +106,7 @@ def test_card_includes_its_figures(dataset: Path) -> None:
 
 
 @pytest.mark.heavy
-def test_writing_it_again_gives_the_same_bytes(dataset: Path) -> None:
+def test_writing_the_card_again_gives_the_same_bytes(dataset: Path) -> None:
     before = {p: p.read_bytes() for p in dataset.rglob("*") if p.is_file()}
     assert run_card(dataset, CardSettings()) == dataset / "README.md"
     assert {p: p.read_bytes() for p in dataset.rglob("*") if p.is_file()} == before

@@ -30,7 +30,7 @@ def test_an_older_manifest_has_no_focal_lengths(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("value", [184, ["x"], [0.0], [True], [float("nan")], None])
-def test_damaged_focal_lengths_are_one_error(tmp_path: Path, value: object) -> None:
+def test_damaged_focal_lengths_give_one_line_error(tmp_path: Path, value: object) -> None:
     Manifest().with_part(SHARDS).write(tmp_path)
     path = tmp_path / MANIFEST_FILE
     path.write_text(json.dumps({**json.loads(path.read_text()), "focal_px": value}))

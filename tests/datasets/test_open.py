@@ -135,7 +135,7 @@ def test_recorded_jpegs_are_kept(record: Record, tmp_path: Path, parquet: bool) 
     assert np.array_equal(part.get_image(2), draw_noise(1003))
 
 
-def test_png_and_jpeg_contradict(record: Record, tmp_path: Path) -> None:
+def test_png_and_jpeg_options_exclude_each_other(record: Record, tmp_path: Path) -> None:
     with pytest.raises(SettingError, match="--png and --pixels jpeg"):
         run([record()], tmp_path / "out", Settings(png=True, pixels="jpeg"))
 
@@ -173,7 +173,7 @@ def test_a_folder_that_is_no_dataset_is_refused_with_the_way_out(tmp_path: Path,
         open_dataset(tmp_path / name)
 
 
-def test_a_missing_shard_is_named(dataset: Path) -> None:
+def test_error_of_a_missing_shard_names_it(dataset: Path) -> None:
     shard = dataset / "train" / "data-00001-of-00002.arrow"
     shard.unlink()
     with pytest.raises(DatasetError, match=f"{shard.name} is missing"):
@@ -181,7 +181,7 @@ def test_a_missing_shard_is_named(dataset: Path) -> None:
 
 
 @pytest.mark.parametrize("share", [0.0, 0.1, 0.5, 0.9])
-def test_a_cut_shard_is_named(dataset: Path, share: float) -> None:
+def test_error_of_a_truncated_shard_names_it(dataset: Path, share: float) -> None:
     shard = dataset / "train" / "data-00000-of-00002.arrow"
     data = shard.read_bytes()
     shard.write_bytes(data[: int(share * len(data))])
@@ -189,7 +189,7 @@ def test_a_cut_shard_is_named(dataset: Path, share: float) -> None:
         open_dataset(dataset).split("train")
 
 
-def test_a_shard_cut_between_two_batches_is_named(dataset: Path) -> None:
+def test_error_of_a_shard_truncated_between_batches_names_it(dataset: Path) -> None:
     shard = dataset / "train" / "data-00000-of-00002.arrow"
     with pa.OSFile(str(shard), "wb") as sink:
         pa.ipc.new_stream(sink, build_schema(HEIGHT_PX, WIDTH_PX)).close()
@@ -197,7 +197,7 @@ def test_a_shard_cut_between_two_batches_is_named(dataset: Path) -> None:
         open_dataset(dataset).split("train")
 
 
-def test_a_missing_parquet_shard_is_named(record: Record, tmp_path: Path) -> None:
+def test_error_of_a_missing_parquet_shard_names_it(record: Record, tmp_path: Path) -> None:
     run([record()], tmp_path / "out", Settings(split="none", parquet=True, shard_images=4))
     (tmp_path / "out/data/train-00000-of-00002.parquet").unlink()
     with pytest.raises(DatasetError, match=r"train-00000-of-00002.parquet is missing"):

@@ -84,7 +84,7 @@ def test_a_shard_that_unpacks_to_much_is_refused(shard: Path) -> None:
 
 
 @pytest.mark.heavy
-def test_a_parquet_file_that_repeats_one_row_without_end_is_refused(
+def test_parquet_file_of_one_row_repeated_many_times_is_refused(
     shard: Path, tmp_path: Path
 ) -> None:
     rows = pa.concat_tables([read_shard(shard).slice(0, 1)] * 20_000).combine_chunks()

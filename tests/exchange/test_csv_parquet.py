@@ -87,7 +87,7 @@ def test_items_of_two_lists_of_a_message_are_paired() -> None:
     assert flatten_table(table.slice(1)).to_pydict() == {n: v[6:] for n, v in flat.items()}
 
 
-def test_an_unreadable_image_topic_leaves_no_folder(recording: Path, tmp_path: Path) -> None:
+def test_unreadable_image_topic_makes_no_folder(recording: Path, tmp_path: Path) -> None:
     path, out = tmp_path / "json.mcap", tmp_path / "out"
     channel = Channel("/x", "foxglove.CompressedImage", b"{}", "jsonschema", "json")
     with RecordingWriter(path, build_provenance("test")) as sink:
@@ -143,7 +143,7 @@ def test_topics_with_colliding_file_names_are_refused(
         "a\r=1",
     ],
 )
-def test_no_text_of_a_csv_is_a_formula(tmp_path: Path, kind: str, text: str) -> None:
+def test_no_text_in_a_csv_is_a_formula(tmp_path: Path, kind: str, text: str) -> None:
     path = tmp_path / "in.mcap"
     with RecordingWriter(path, build_provenance("test")) as sink:
         labels = message_class("PeerLabels")(peers=[{"peer": text, "u_px": -1.5, "source": "hand"}])
@@ -160,7 +160,7 @@ def test_no_text_of_a_csv_is_a_formula(tmp_path: Path, kind: str, text: str) -> 
     assert float(row["peers.u_px"]) == -1.5  # negative numbers stay numbers
 
 
-def test_two_pictures_of_one_time_are_two_files(tmp_path: Path) -> None:
+def test_two_images_of_one_time_become_two_files(tmp_path: Path) -> None:
     path, pictures = tmp_path / "in.mcap", [PNG, encode_png(np.zeros((4, 4, 3), np.uint8))]
     with RecordingWriter(path, build_provenance("test")) as sink:
         for data in pictures:

@@ -194,7 +194,7 @@ def build_features(info: dict[str, Any]) -> Any:
     return hf.Features(types)
 
 
-def test_lerobot_s_layout_is_read_by_its_schema(source: Path) -> None:
+def test_lerobot_export_matches_its_schema(source: Path) -> None:
     hf = pytest.importorskip("datasets")
     pandas = pytest.importorskip("pandas")
     out = export_set(source, "lerobot")

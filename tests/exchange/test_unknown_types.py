@@ -57,7 +57,7 @@ def write_message(
         (["_", "field"], ["field_1", "field_2"]),
     ],
 )
-def test_fields_of_a_bag_have_names_that_ros_takes(
+def test_fields_in_a_bag_have_valid_ros_names(
     names: list[str], wanted: list[str], tmp_path: Path
 ) -> None:
     path = write_message(tmp_path, *({"name": name} for name in names))
@@ -69,7 +69,7 @@ def test_fields_of_a_bag_have_names_that_ros_takes(
 
 
 @pytest.mark.parametrize(("name", "wanted"), [("_", "Type"), ("_1", "Type1"), ("class", "Class")])
-def test_types_of_a_bag_have_names_that_ros_takes(name: str, wanted: str, tmp_path: Path) -> None:
+def test_types_in_a_bag_have_valid_ros_names(name: str, wanted: str, tmp_path: Path) -> None:
     write_bag(write_message(tmp_path, {}, name=name), tmp_path / "bag")
     with AnyReader([tmp_path / "bag"]) as reader:
         assert [c.msgtype for c in reader.connections] == [f"dmrl_msgs/msg/{wanted}"]

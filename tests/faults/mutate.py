@@ -146,6 +146,7 @@ def _skip_varint(data: bytes, at: int) -> int:
 
 
 def _encode_varint(value: int) -> bytes:
+    """Return an integer as a protobuf varint."""
     out = bytearray()
     while value >= 128:
         out.append(value & 127 | 128)

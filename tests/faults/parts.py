@@ -115,6 +115,7 @@ def compute_crcs(records: Sequence[Record]) -> tuple[int, int]:
 
 
 def _correct_message_index(body: bytes, moved: dict[int, int]) -> bytes:
+    """Return a message index with the new offsets of its messages within the chunk."""
     out = bytearray(body)
     for at in range(6, len(out) - 15, 16):
         (place,) = struct.unpack_from("<Q", out, at + 8)

@@ -62,6 +62,7 @@ def run_in_child(told: dict[str, Any], inputs: Inputs, told_in: Path) -> dict[st
 
 
 def _answer_job(told: dict[str, Any], inputs: Inputs, told_in: Path) -> None:
+    """Call the function of a job, write its result or traceback to a file, and exit."""
     answer: dict[str, Any]
     try:
         signal.alarm(HANG_S)

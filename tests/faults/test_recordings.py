@@ -192,6 +192,7 @@ def fuzz_readers(folder: Path, cases: int, seed: int, count: Count) -> None:
 
 
 def _fuzz_readers(folder: Path, cases: int, seed: int, count: Count) -> None:
+    """Run `fuzz_readers`; assert that readers are also compared and new code is reached."""
     path = folder / "a.mcap"
     corpus = [
         write_own_recording(path),

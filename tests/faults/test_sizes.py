@@ -32,7 +32,9 @@ TEXTS = {
 Make = Callable[[Path], tuple[Path, Path]]
 
 
-def _text(name: str) -> Make:
+def make_text_source(name: str) -> Make:
+    """Return a function that writes a text file of a format; it returns source and file."""
+
     def make(folder: Path) -> tuple[Path, Path]:
         called, text = TEXTS.get(name, ("a.csv", b"time,a\n1,2\n"))
         (folder / called).write_bytes(text)
@@ -42,7 +44,7 @@ def _text(name: str) -> Make:
 
 
 OTHERS = load_builtin_formats().keys() - {name for name, _ in SOURCES.values()}
-ALL = {**SOURCES, **{name: (name, _text(name)) for name in sorted(OTHERS)}}
+ALL = {**SOURCES, **{name: (name, make_text_source(name)) for name in sorted(OTHERS)}}
 
 
 def iter_odd_files(file: Path) -> Iterator[str]:

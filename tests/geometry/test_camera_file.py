@@ -16,7 +16,7 @@ def test_camera_file_round_trips(camera: Camera, tmp_path: Path) -> None:
     assert read_camera(path) == camera
 
 
-def test_a_camera_has_a_name_or_a_file(tmp_path: Path) -> None:
+def test_camera_is_found_by_name_or_file(tmp_path: Path) -> None:
     assert find_camera(Path("published")) == PUBLISHED_RENDER
     path = tmp_path / "camera.toml"
     path.write_text(format_camera(AIDECK))

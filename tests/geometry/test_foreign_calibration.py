@@ -57,7 +57,7 @@ def write_text(path: Path, text: str) -> Path:
 
 
 @pytest.mark.parametrize("text", [ROS, MESSAGE, f"{MESSAGE}---\n", f"---\n{MESSAGE}---\n{MESSAGE}"])
-def test_files_of_ros(text: str, tmp_path: Path) -> None:
+def test_ros_files_are_read(text: str, tmp_path: Path) -> None:
     assert read_camera(write_text(tmp_path / "camera.yaml", text)) == WANTED
 
 
@@ -69,7 +69,7 @@ def test_a_file_of_kalibr_has_four_coefficients(tmp_path: Path) -> None:
         read_camera(write_text(tmp_path / "two.yaml", two))
 
 
-def test_a_sensor_file_of_euroc_is_one_camera(tmp_path: Path) -> None:
+def test_euroc_sensor_file_is_read(tmp_path: Path) -> None:
     lines = [line.strip() for line in KALIBR.splitlines()[2:]]
     text = "sensor_type: camera\n" + "\n".join(lines).replace("radtan", "radial-tangential")
     text = text.replace("distortion_coeffs", "distortion_coefficients")
@@ -79,7 +79,7 @@ def test_a_sensor_file_of_euroc_is_one_camera(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("suffix", ["yml", "json", "xml"])
 @pytest.mark.parametrize("coefficients", [4, 5, 8, 14])
-def test_files_that_opencv_writes(suffix: str, coefficients: int, tmp_path: Path) -> None:
+def test_opencv_files_are_read(suffix: str, coefficients: int, tmp_path: Path) -> None:
     path = tmp_path / f"camera.{suffix}"
     d = np.zeros(coefficients)
     d[:4] = D[:4]
@@ -180,7 +180,7 @@ def test_four_coefficients_without_a_model_are_named_as_plumb_bob(
         read_camera(path)
 
 
-def test_a_message_is_of_the_region_and_the_binning_of_its_images(tmp_path: Path) -> None:
+def test_camera_info_is_adapted_to_its_region_and_binning(tmp_path: Path) -> None:
     roi = "{x_offset: 100, y_offset: 40, height: 180, width: 200, do_rectify: true}"
     told = f"{MESSAGE}binning_x: 2\nbinning_y: 3\nroi: {roi}\n"
     found = read_camera(write_text(tmp_path / "camera.yaml", told))

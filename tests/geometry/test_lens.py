@@ -16,7 +16,7 @@ def test_folded_lens_model_gives_no_pixel_far_out() -> None:
     assert np.isnan(bent[1]).any()
 
 
-def test_undistorting_undoes_the_lens() -> None:
+def test_undistort_inverts_distort() -> None:
     plane = np.random.default_rng(0).uniform(-0.9, 0.9, (100, 2))
     bent, _ = distort(plane, AIDECK.distortion)
     assert np.allclose(undistort(bent, AIDECK.distortion), plane, atol=1e-9)
@@ -26,7 +26,7 @@ PLANE = np.random.default_rng(1).uniform(-0.5, 0.5, (50, 2))
 LENS = (0.12, -0.05, 0.013, -0.021, 0.03)
 
 
-def test_the_model_is_opencvs() -> None:
+def test_lens_model_equals_opencv() -> None:
     points = np.column_stack([PLANE, np.ones(len(PLANE))])
     wanted, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), np.eye(3), np.array(LENS))
     np.testing.assert_allclose(distort(PLANE, LENS)[0], wanted[:, 0], atol=1e-12)
@@ -41,7 +41,7 @@ def test_distortion_derivatives_equal_finite_differences() -> None:
 
 
 @pytest.mark.parametrize("k1", [-0.3, -0.5])
-def test_the_lens_folds_back_where_its_slope_ends(k1: float) -> None:
+def test_lens_folds_where_its_derivative_is_zero(k1: float) -> None:
     fold = np.sqrt(-1 / (3 * k1))  # where the derivative of r + k1 r^3 is zero
     inner, outer = distort(np.array([[0.999 * fold, 0.0], [0.0, 1.001 * fold]]), (k1,))[0]
     assert np.isfinite(inner).all()

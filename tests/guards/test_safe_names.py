@@ -61,7 +61,7 @@ def test_topics_have_distinct_file_names() -> None:
 
 
 @pytest.mark.parametrize("name", ["", "a/b", "a\nb", "a" * 300])
-def test_a_robot_s_name_is_one_part_of_a_topic(name: str) -> None:
+def test_robot_name_is_a_single_part_of_a_topic(name: str) -> None:
     with pytest.raises(UnsafeName, match="a robot is called"):
         topics.HEIGHT(name)
 
@@ -69,7 +69,7 @@ def test_a_robot_s_name_is_one_part_of_a_topic(name: str) -> None:
 @pytest.mark.parametrize(
     "text", ["*/ int x; /*", "a\nb", "a\\\nb", "??/\n", '"', "$(shell x)", "\r", "\u2028", "`x`"]
 )
-def test_nothing_ends_a_comment(text: str) -> None:
+def test_no_text_ends_a_comment(text: str) -> None:
     assert not set(comment_safe(text)) & set("*/\\\n\r?\"'$`\u2028<>[]#")
 
 

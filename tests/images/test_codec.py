@@ -39,15 +39,17 @@ def test_ppm_may_hold_comments_and_junk() -> None:
     assert codec.read_size(ppm) == (2, 1, "ppm")
 
 
-def test_real_frames_with_junk_behind_their_pixels(data: Path) -> None:
-    for path in (data / "aideck-frames").glob("*.ppm"):
+def test_frames_with_trailing_bytes_are_decoded(data: Path) -> None:
+    if not (frames := sorted((data / "aideck-frames").glob("*.ppm"))):
+        pytest.skip("the frames of the AI-deck are not there")
+    for path in frames:
         bytes_ = path.read_bytes()
         pixels = np.frombuffer(bytes_[15 : 15 + 320 * 224 * 3], np.uint8)
         np.testing.assert_array_equal(codec.decode(bytes_).ravel(), pixels)
 
 
 @pytest.mark.parametrize("share", [0.9, 0.5, 0.1])
-def test_a_cut_picture_is_named(rgb: codec.Rgb, share: float) -> None:
+def test_error_of_a_truncated_image_names_it(rgb: codec.Rgb, share: float) -> None:
     png = codec.encode_png(rgb)
     with pytest.raises(SourceError, match=r"^a\.png cannot be decoded: .*Remove it") as e:
         codec.decode(png[: int(len(png) * share)], "a.png")
@@ -61,7 +63,7 @@ def test_invalid_image_is_reported_by_name(bad: bytes) -> None:
             function(bad, "a.png")
 
 
-def test_a_picture_of_indexed_colours_without_their_palette_is_named(rgb: codec.Rgb) -> None:
+def test_indexed_image_without_a_palette_is_refused(rgb: codec.Rgb) -> None:
     stream = BytesIO()
     Image.fromarray(rgb).convert("P").save(stream, "PNG")
     assert codec.decode(stream.getvalue()).shape == rgb.shape
@@ -81,7 +83,7 @@ def correct_crcs(png: bytes) -> bytes:
     return out
 
 
-def test_the_part_that_is_scaled_is_the_one_named() -> None:
+def test_crop_and_scale_takes_the_given_region() -> None:
     rgb = np.zeros((40, 60, 3), np.uint8)
     rgb[10:30, 20:40] = 200
     part = codec.crop_and_scale(rgb, (20, 10, 40, 30), 10, 10)

@@ -10,7 +10,7 @@ def test_results_come_in_the_order_of_the_items(threads: int) -> None:
     assert list(map_ahead(lambda k: k * k, range(50), threads)) == [k * k for k in range(50)]
 
 
-def test_an_error_comes_when_it_is_its_turn() -> None:
+def test_error_is_raised_in_the_order_of_its_item() -> None:
     results = map_ahead(lambda k: 10 // (3 - k), range(6), 2)
     assert [next(results) for _ in range(3)] == [3, 5, 10]
     with pytest.raises(ZeroDivisionError):

@@ -116,7 +116,7 @@ def test_unusable_topics_are_reported(tmp_path: Path) -> None:
     }
 
 
-def test_messages_and_schemas_that_cannot_be_used_spare_the_others(tmp_path: Path) -> None:
+def test_unusable_messages_and_schemas_do_not_affect_others(tmp_path: Path) -> None:
     height = message_class("Height")
     with (tmp_path / "a.mcap").open("wb") as stream:
         writer = PlainWriter(stream)
@@ -259,7 +259,9 @@ def test_json_times_have_several_forms(
 
 @pytest.mark.parametrize("profile", ["", "ros2"])
 @pytest.mark.parametrize("other", ["json", "protobuf", ""])
-def test_messages_of_ros_beside_others(profile: str, other: str, tmp_path: Path) -> None:
+def test_ros_messages_beside_other_encodings_are_converted(
+    profile: str, other: str, tmp_path: Path
+) -> None:
     store = get_typestore(Stores.ROS2_HUMBLE)
     kind = "geometry_msgs/msg/PoseStamped"
     held, types = build_pose().pose, store.types

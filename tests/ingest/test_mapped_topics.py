@@ -189,7 +189,7 @@ def test_column_map_reads_topics_of_any_encoding(
     np.testing.assert_array_equal(found["/cf1/range/cf2"].to_pandas()["log_time"], times + 9)
 
 
-def test_topics_that_the_table_does_not_name_are_left_out_by_name(tmp_path: Path) -> None:
+def test_topics_not_in_the_table_are_reported_as_left_out(tmp_path: Path) -> None:
     source = write_json(
         tmp_path / "a", [*build_messages("red"), ("/chat", "Uwb", START_NS, {"d": 1.0})]
     )
@@ -230,7 +230,7 @@ def test_table_that_fits_no_topic_gives_one_line_error(text: str, why: str, tmp_
     assert "\n" not in str(e.value) and not (tmp_path / "out.mcap").exists()
 
 
-def test_the_time_may_be_a_field(tmp_path: Path) -> None:
+def test_time_can_be_read_from_a_field(tmp_path: Path) -> None:
     sent = [("/s", "Uwb", START_NS + k, {"z": 1.0, "t": 5 + 0.5 * k}) for k in range(20)]
     table = '[time]\nname = ":t"\nunit = "s"\n[height]\nname = "/s:z"\nunit = "m"\n'
     (tmp_path / "map.toml").write_text(table)

@@ -74,7 +74,7 @@ def test_recordings_in_subfolders_are_found_but_not_other_or_hidden_files(flight
     assert [str(name) for name in find_recordings(flights, but=outs)] == names
 
 
-def test_special_characters_in_file_names_are_no_pattern(tmp_path: Path) -> None:
+def test_special_characters_in_file_names_are_no_glob_pattern(tmp_path: Path) -> None:
     assert not is_collection(write_recording(tmp_path / "a[1].mcap"))
     assert is_collection(tmp_path / "b[1].mcap")
 
@@ -191,7 +191,7 @@ def test_check_of_a_folder_with_an_invalid_recording_fails_in_json_and_status(
     ]
 
 
-def test_sources_in_a_folder_become_recordings_of_their_names(
+def test_each_source_in_a_folder_becomes_a_recording_of_its_name(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for name in ("one", "two"):

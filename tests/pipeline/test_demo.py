@@ -18,13 +18,13 @@ SHA256 = "ccd119a831c802188a0c78f2ad84d02a0363806670633ffa6a8a68fa8eaf1b74"
 """SHA-256 of the output of ``dmrl fly demo_flight recipes/demo_flight.mcap``."""
 
 
-def test_the_flight_that_ships_is_small_and_the_one_that_was_made() -> None:
+def test_shipped_flight_is_small_and_has_the_known_hash() -> None:
     content = FLIGHT.read_bytes()
     assert len(content) <= 3_000_000
     assert hashlib.sha256(content).hexdigest() == SHA256
 
 
-def test_the_flight_that_ships_has_the_settings_of_its_recipe() -> None:
+def test_shipped_flight_has_the_settings_of_its_recipe() -> None:
     with FLIGHT.open("rb") as stream:
         held = {one.name: one.data for one in make_reader(stream).iter_attachments()}
     made_with = tomllib.loads(held["recipe.toml"].decode())
@@ -32,14 +32,14 @@ def test_the_flight_that_ships_has_the_settings_of_its_recipe() -> None:
     assert {key: made_with[key] for key in wanted} == wanted
 
 
-def test_a_step_reads_the_flight_by_its_name(tmp_path: Path) -> None:
+def test_step_finds_the_shipped_flight_by_name(tmp_path: Path) -> None:
     assert locate_input("demo_flight.mcap", set(), tmp_path, None).samefile(FLIGHT)
     assert locate_input("demo_flight.mcap", {"demo_flight.mcap"}, tmp_path, None).parent == tmp_path
     assert recipe.locate_recording("../demo_flight.mcap") is None
     assert recipe.locate_recording("demo.toml") is None
 
 
-def test_the_closing_lines_activate_an_environment_that_is_not_on_the_path(tmp_path: Path) -> None:
+def test_suggested_commands_activate_the_environment_if_needed(tmp_path: Path) -> None:
     (tmp_path / "activate").touch()
     assert suggest_commands(Path("demo"), f"{tmp_path}/dmrl").startswith(f"  source {tmp_path}/act")
     assert suggest_commands(Path("demo"), "dmrl").startswith("  dmrl view demo/")

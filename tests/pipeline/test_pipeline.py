@@ -65,7 +65,7 @@ def test_a_pipeline_gives_the_same_bytes_with_any_number_of_workers(
 
 
 @pytest.mark.heavy
-def test_an_edited_recipe_goes_on_in_the_same_folder(tmp_path: Path) -> None:
+def test_edited_recipe_continues_in_the_same_folder(tmp_path: Path) -> None:
     recipe, out = (
         write_recipe(tmp_path, SMALL.replace("from_s = 0.05", "from_s = 99.0")),
         tmp_path / "o",

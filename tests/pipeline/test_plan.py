@@ -50,7 +50,7 @@ def test_step_keys_become_inputs_or_settings(tmp_path: Path) -> None:
     assert plan.needs_data and plan.text == SMALL
 
 
-def test_one_name_for_an_input_of_many_is_a_list_of_one(tmp_path: Path) -> None:
+def test_single_name_for_a_list_input_becomes_a_list(tmp_path: Path) -> None:
     text = 'step = [{ stage = "evaluate", recordings = "{data}/f.mcap", out = "judged" }]'
     assert load_recipe(tmp_path, HEAD + text).steps[0].inputs == {"recordings": ["{data}/f.mcap"]}
 
@@ -61,7 +61,7 @@ def test_step_order_follows_dependencies(tmp_path: Path) -> None:
     assert list(plan.order.static_order()) == ["pictures", "pictures.mcap", "both.mcap"]
 
 
-def test_a_setting_that_names_a_file_is_something_that_is_read(tmp_path: Path) -> None:
+def test_file_named_by_a_setting_is_a_dependency(tmp_path: Path) -> None:
     text = """
     step = [
       { stage = "label", recording = "{data}/f.mcap", out = "l.mcap", camera = { cf1 = "c.toml" } },
@@ -71,12 +71,13 @@ def test_a_setting_that_names_a_file_is_something_that_is_read(tmp_path: Path) -
     """
     plan = load_recipe(tmp_path, HEAD + text)
     assert plan.steps[0].names == ["{data}/f.mcap", "c.toml"]
-    assert list(plan.order.static_order()).index("c.toml") == 0 or "c.toml" in plan.steps[0].names
+    order = list(plan.order.static_order())
+    assert order.index("c.toml") < order.index("l.mcap")
     with pytest.raises(RecipeError, match=r"label reads d\.toml, which no step writes"):
         load_recipe(tmp_path, HEAD + text.replace('cf1 = "c.toml"', 'cf1 = "d.toml"'))
 
 
-def test_keys_come_before_those_of_a_recipe_and_its_preset(tmp_path: Path) -> None:
+def test_keys_of_a_step_override_its_recipe_and_preset(tmp_path: Path) -> None:
     path = tmp_path / "rooms.toml"
     path.write_text('kind = "render"\npreset = "himax"\nimages = 7\nseed = 3\n')
     text = f'step = [{{ stage = "render", out = "r.mcap", recipe = "{path}", images = 2 }}]'
@@ -87,12 +88,12 @@ def test_keys_come_before_those_of_a_recipe_and_its_preset(tmp_path: Path) -> No
         load_recipe(tmp_path, HEAD + text.replace('stage = "render"', 'stage = "fly"'))
 
 
-def test_an_error_that_ends_with_a_question_has_no_period_behind_it(tmp_path: Path) -> None:
+def test_error_that_ends_with_a_question_mark_gets_no_period(tmp_path: Path) -> None:
     with pytest.raises(RecipeError, match=r"1 wrong key: .* Did you mean images\? Fix it$"):
         load_recipe(tmp_path, SMALL.replace("images = 2", "imags = 2"))
 
 
-def test_an_argument_of_the_command_line_alone_is_named(tmp_path: Path) -> None:
+def test_argument_of_the_command_line_only_is_refused_in_a_step(tmp_path: Path) -> None:
     with pytest.raises(RecipeError, match="workers: sketch takes it on the command line alone"):
         load_recipe(tmp_path, SMALL.replace("images = 2", "images = 2\nworkers = 2"))
 
@@ -195,7 +196,7 @@ def test_stage_interface_is_read_from_its_run_signature() -> None:
     assert list(signature_of("record").others) == ["robots"]
 
 
-def test_a_stage_that_a_package_adds_is_a_step(
+def test_stage_of_a_plugin_package_is_a_step(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def run(recording: Path, out: Path) -> None: ...
@@ -210,7 +211,7 @@ def test_a_stage_that_a_package_adds_is_a_step(
         load_recipe(tmp_path, HEAD + text.replace("smooth", "smoth"))
 
 
-def test_other_arguments_of_run_are_checked_as_well(tmp_path: Path) -> None:
+def test_arguments_that_are_not_settings_are_checked_too(tmp_path: Path) -> None:
     robots = '{ name = "cf1", uri = "radio://0/80/2M/E7E7E7E7E7" }'
     text = f'{HEAD}step = [{{ stage = "record", out = "f.mcap", robots = [{robots}] }}]'
     assert load_recipe(tmp_path, text).steps[0].settings["robots"][0]["name"] == "cf1"

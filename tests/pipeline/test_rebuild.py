@@ -61,7 +61,7 @@ def test_differences_of_a_rebuilt_recording_are_printed(
     assert "came out otherwise" in output and "0.0.1" in output and "differs from" in output
 
 
-def test_a_recording_of_others_is_refused(tmp_path: Path) -> None:
+def test_recording_without_provenance_is_refused(tmp_path: Path) -> None:
     write_chunks(tmp_path / "a.mcap")
     with pytest.raises(RecordingError, match="has no provenance"):
         rebuild(tmp_path / "a.mcap", tmp_path / "b.mcap")

@@ -34,7 +34,7 @@ step = [
 
 
 @pytest.mark.parametrize("values", ['"3-5"', "[3, 4, 5]"])
-def test_a_name_in_out_repeats_and_in_inputs_alone_gathers(values: str) -> None:
+def test_placeholder_in_out_repeats_a_step_and_in_inputs_lists_all_values(values: str) -> None:
     assert expand_valid(FLIGHTS + f"flight = {values}") == [
         *[
             {"stage": "fly", "seed": n, "title": f"no. {n}", "out": f"flight-{n}.mcap"}

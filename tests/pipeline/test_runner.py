@@ -172,14 +172,14 @@ def test_failed_optional_step_blocks_its_dependents(
     assert run(maybe, B, BOTH)[1].made == ["a", "both"]
 
 
-def test_a_file_of_somebody_else_is_never_replaced(run: Run, tmp_path: Path) -> None:
+def test_foreign_file_is_never_replaced(run: Run, tmp_path: Path) -> None:
     (tmp_path / "a").write_text("my thesis")
     with pytest.raises(OutputError, match=r"this pipeline did not write it\. Move or rename it"):
         run(A)
     assert (tmp_path / "a").read_text() == "my thesis"
 
 
-def test_a_folder_takes_the_place_of_a_folder(run: Run, tmp_path: Path) -> None:
+def test_output_file_replaces_a_folder_of_its_name(run: Run, tmp_path: Path) -> None:
     run(A)
     (tmp_path / "a").unlink()
     (tmp_path / "a").mkdir()
@@ -205,7 +205,7 @@ def test_killed_step_resumes_unless_it_changed(run: Run, tmp_path: Path) -> None
     assert render(2) == (False, False)
 
 
-def test_workers_of_a_stage_are_no_reason_to_run_it_again(run: Run) -> None:
+def test_changed_number_of_workers_does_not_rerun_a_step(run: Run) -> None:
     run(Step("render", "r.mcap", settings={"workers": 1}))
     done, crew = run(Step("render", "r.mcap", settings={"workers": 2}))
     assert done[0].skipped and not crew.made

@@ -54,7 +54,7 @@ def write_recording(path: Path, *metadata: tuple[str, dict[str, str]]) -> Path:
     return path
 
 
-def test_a_split_is_its_intervals_by_name(tmp_path: Path) -> None:
+def test_split_has_all_intervals_of_its_name(tmp_path: Path) -> None:
     path = write_recording(
         tmp_path / "a.mcap",
         ("dmrl.split", {"train": "[[0, 10], [30, 40]]", "test": "[[20, 25]]"}),
@@ -106,7 +106,7 @@ def test_licence_title_is_the_first_line_of_the_licence_file(tmp_path: Path) -> 
     assert extract_licence_title(found) == "empty"
 
 
-def test_licences_of_recordings_are_put_together(tmp_path: Path) -> None:
+def test_licences_of_several_recordings_are_combined(tmp_path: Path) -> None:
     paths = [
         write_recording(tmp_path / "a.mcap", (LICENCES_METADATA, {"b": "MIT"})),
         write_recording(tmp_path / "b.mcap", (LICENCES_METADATA, {"a": "CC0"})),
@@ -117,7 +117,7 @@ def test_licences_of_recordings_are_put_together(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("indexed", [True, False])
-def test_a_topic_of_two_channels_is_one_topic(indexed: bool, tmp_path: Path) -> None:
+def test_two_channels_of_one_topic_are_one_topic(indexed: bool, tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     with path.open("wb") as stream:
         kinds = IndexType.ALL if indexed else IndexType.NONE

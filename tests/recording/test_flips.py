@@ -146,7 +146,7 @@ def remove_chunk(data: bytes, number: int) -> bytes:
     return data[: found[first][1]] + data[found[last][2] :]
 
 
-def test_a_removed_chunk_is_missed_by_topic(tmp_path: Path) -> None:
+def test_removed_chunk_is_reported_with_its_losses_by_topic(tmp_path: Path) -> None:
     path = write_small_recording(tmp_path / "a.mcap")
     path.write_bytes(remove_chunk(path.read_bytes(), 1))
     for use in (

@@ -55,7 +55,7 @@ def test_info_abbreviates_repeated_ancestors() -> None:
     ]
 
 
-def test_settings_in_tables_have_their_table_and_zero_is_a_setting() -> None:
+def test_listed_settings_have_dotted_names_and_include_zero() -> None:
     made = Provenance("fly", {"eye": None, "vision": {"lost_share": 0.0, "lost": []}, "seed": 0})
     assert made.list_settings() == [("vision.lost_share", "0.0"), ("seed", "0")]
     assert ancestry_lines(made)[0].endswith(" fly vision.lost_share=0.0 seed=0")

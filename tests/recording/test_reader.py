@@ -188,7 +188,9 @@ def test_memory_stays_bounded_when_chunks_touch_in_time(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("share", [0.9, 0.5, 0.1])
-def test_a_truncated_file_names_the_way_out(flight: Path, tmp_path: Path, share: float) -> None:
+def test_error_of_a_truncated_file_names_the_way_out(
+    flight: Path, tmp_path: Path, share: float
+) -> None:
     cut = tmp_path / "cut.mcap"
     cut.write_bytes(flight.read_bytes()[: int(flight.stat().st_size * share)])
     for use in (
@@ -241,7 +243,7 @@ def test_every_flipped_byte_is_an_error_or_changes_nothing(flight: Path, tmp_pat
         assert [(r.time_ns, r.data) for r in got] == [(r.time_ns, r.data) for r in good], at
 
 
-def test_a_bad_message_is_named(tmp_path: Path) -> None:
+def test_error_of_a_damaged_message_names_its_topic(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     with path.open("wb") as stream:
         writer = Writer(stream)
@@ -273,7 +275,7 @@ def test_span_without_messages_gives_an_empty_table(flight: Path) -> None:
 
 
 @pytest.mark.heavy
-def test_topics_are_read_in_one_pass_as_one_by_one(
+def test_topics_read_in_one_pass_equal_those_read_one_by_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(batch_reader, "JOINED_BYTES", 10_000)

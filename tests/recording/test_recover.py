@@ -56,7 +56,7 @@ def test_truncated_file_reports_indexed_losses_only(
     assert (found.counted, found.lost_bytes, found.whole) == (False, 1000, False)
 
 
-def test_metadata_that_fail_their_sum_are_kept_and_doubted(tmp_path: Path) -> None:
+def test_metadata_with_a_wrong_checksum_are_kept_and_doubted(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     with RecordingWriter(path, Provenance("test")) as sink:
         sink.write(0, TOPICS[0], message_class("Height")())
@@ -84,7 +84,7 @@ def test_messages_beyond_2262_are_left_out_and_counted(tmp_path: Path) -> None:
     assert [raw.time_ns for raw in read_raw(tmp_path / "b.mcap")] == [1, 2**63 - 2]
 
 
-def test_magic_bytes_alone_are_a_recording_that_holds_nothing(tmp_path: Path) -> None:
+def test_recover_refuses_a_file_without_a_whole_chunk(tmp_path: Path) -> None:
     for content, words in ((b"\x89MCAP0\r\n", "holds no whole chunk"), (b"\x89MC", "not begin")):
         (tmp_path / "a.mcap").write_bytes(content)
         with pytest.raises(RecordingError, match=words):

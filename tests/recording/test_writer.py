@@ -69,7 +69,7 @@ def test_an_error_leaves_no_file(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_topic_of_dmrl_takes_only_its_own_message(tmp_path: Path) -> None:
+def test_known_topic_accepts_only_its_own_message_type(tmp_path: Path) -> None:
     with (
         pytest.raises(RecordingError, match=r"/cf1/labels carries dmrl.v1.PeerLabels"),
         RecordingWriter(tmp_path / "a.mcap", Provenance("test")) as sink,
@@ -90,7 +90,7 @@ def test_provenance_and_recipe_precede_the_first_message(flight: Path) -> None:
     assert data.index(b"dmrl.provenance") < 64
 
 
-def test_publish_time_is_kept_apart_from_log_time(tmp_path: Path) -> None:
+def test_publish_time_is_stored_separately_from_log_time(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     with RecordingWriter(path, Provenance("test")) as sink:
         sink.write(5, "/cf1/height", HEIGHT(), publish_ns=9)

@@ -51,6 +51,7 @@ _watched: list[tuple[str, str]] | None = None
 
 
 def _record_event(event: str, args: tuple[Any, ...]) -> None:
+    """Record audit events that change files while a block is watched."""
     if _watched is None:
         return
     if event == "open" and isinstance(args[2], int) and args[2] & WRITES:

@@ -150,7 +150,7 @@ def test_links_in_out_are_not_written_through(
 
 
 @pytest.mark.parametrize("name", ["../../victim/x", "{victim}/x", "recipe.toml", "..", "a/../../x"])
-def test_a_recipe_s_step_writes_in_the_pipeline_s_folder(
+def test_step_of_a_recipe_writes_only_in_the_pipeline_folder(
     name: str, box: Box, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = name.replace("{victim}", str(box.victim))

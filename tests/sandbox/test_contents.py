@@ -84,7 +84,7 @@ def test_a_split_of_a_label_table_stays_in_the_dataset(
 
 @pytest.mark.usefixtures("empty_figures")
 @pytest.mark.heavy
-def test_a_hostile_dataset_is_read_and_carded_where_it_is(
+def test_hostile_dataset_changes_nothing_outside_its_folder(
     box: Box, capsys: pytest.CaptureFixture[str]
 ) -> None:
     bad = write_hostile_recording(box.root / "in" / "bad.mcap")
@@ -189,7 +189,7 @@ def test_a_model_s_names_do_not_become_code(box: Box, capsys: pytest.CaptureFixt
         (("heads",), []),
     ],
 )
-def test_a_model_s_numbers_are_numbers(
+def test_invalid_numbers_in_a_model_are_refused(
     path: tuple[Any, ...], value: Any, box: Box, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder, arrays = build_model_arrays(box)
@@ -205,7 +205,7 @@ def test_a_model_s_numbers_are_numbers(
 
 @pytest.mark.parametrize("name", ["layer0.bias", "layer0.multiplier"])
 @pytest.mark.parametrize("size", [0, 1])
-def test_a_model_has_a_number_for_each_channel(
+def test_model_must_have_a_number_for_each_channel(
     name: str, size: int, box: Box, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder, arrays = build_model_arrays(box)

@@ -60,7 +60,7 @@ def box_with_inputs(box: Box) -> Box:
     ["run", *(pytest.param(c, marks=pytest.mark.heavy) for c in list(COMMANDS)[1:])],
 )
 @pytest.mark.heavy
-def test_hostile_toml_is_one_line_that_names_it(
+def test_hostile_toml_gives_one_line_error_that_names_it(
     command: str, box_with_inputs: Box, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = box_with_inputs.root / "in" / "strange.toml"

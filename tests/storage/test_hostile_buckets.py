@@ -194,7 +194,7 @@ class Handler(BaseHTTPRequestHandler):
         self.store.most_sent = max(self.store.most_sent, sent)
 
     def log_message(self, *_: object) -> None:
-        """Nothing."""
+        """Print nothing."""
 
 
 @pytest.fixture(scope="module")
@@ -305,7 +305,7 @@ def test_an_upload_that_is_not_stored_is_an_error(wrong: str, store: Store) -> N
 
 
 @pytest.mark.parametrize("key", ["t\x1b[2J.mcap", "a\rb.mcap", "a\x7f/b.mcap", "\u202egnp.mcap"])
-def test_a_key_with_control_characters_becomes_no_file(
+def test_key_with_control_characters_is_refused(
     key: str, store: Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder = to_path("s3://lab/set")

@@ -87,7 +87,7 @@ def test_command_between_buckets_equals_local_output(
 
 
 @pytest.mark.heavy
-def test_a_folder_in_a_bucket_is_done_and_indexed(
+def test_commands_work_on_folders_in_a_bucket(
     lab: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for name in ("a.mcap", "b/c.mcap", ".hidden/d.mcap"):
@@ -291,7 +291,7 @@ def measure_chunks(path: Path) -> tuple[int, int]:
     return sizes[0], sizes[1]
 
 
-def test_a_name_in_a_bucket_leads_nowhere_else_on_this_machine(
+def test_bucket_keys_never_lead_outside_the_output_folder(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Keys may be any text, but a copied folder must stay inside the output folder."""

@@ -203,7 +203,7 @@ def test_images_with_ambiguous_labels_are_omitted_without_keep_all(
     assert [p["status"] for p in statuses] == ["OK", "AMBIGUOUS"]
 
 
-def test_same_input_same_bytes(record: Record, tmp_path: Path) -> None:
+def test_same_input_gives_the_same_bytes(record: Record, tmp_path: Path) -> None:
     flights = [record(), record("other.mcap", seed=1)]
     for name in ("a", "b"):
         run(flights, tmp_path / name, Settings(shard_images=4))
@@ -299,7 +299,7 @@ def test_datasets_are_never_overwritten(record: Record, tmp_path: Path) -> None:
     assert list((tmp_path / "out").iterdir()) == []
 
 
-def test_a_run_that_dies_in_the_middle_leaves_no_dataset(
+def test_interrupted_run_leaves_no_dataset(
     record: Record, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def die(*_: Any, **__: Any) -> None:

@@ -128,7 +128,9 @@ def test_two_recordings_of_one_name_are_refused(record: Record, tmp_path: Path) 
         run(flights, tmp_path / "out", Settings())
 
 
-def test_a_recording_beside_one_made_of_it_is_refused(record: Record, tmp_path: Path) -> None:
+def test_recording_and_one_derived_from_it_are_refused_together(
+    record: Record, tmp_path: Path
+) -> None:
     flight, copy = record("x.mcap"), tmp_path / "copy.mcap"
     trim(flight, copy)
     for both in ([flight, copy], [copy, flight]):
@@ -176,7 +178,7 @@ def test_two_images_at_one_time_are_refused(record: Record, tmp_path: Path) -> N
 
 
 @pytest.mark.heavy
-def test_labels_that_a_merge_doubled_count_once(record: Record, tmp_path: Path) -> None:
+def test_labels_doubled_by_a_merge_count_once(record: Record, tmp_path: Path) -> None:
     flight, more = record("a.mcap"), tmp_path / "b.mcap"
     with RecordingWriter(more, Provenance("test")) as sink:
         for stamped in read(flight, "/cf1/labels"):

@@ -183,6 +183,7 @@ def test_labels_equal_one_process_even_if_a_node_dies(
 
 
 def _kill_after(nodes: Nodes, out: Path, seed: int) -> None:
+    """Kill the other node once a random number of outputs exists."""
     after = random.Random(seed).randrange(COUNT - 10)
     while len(list(out.rglob("*.mcap"))) <= after:
         time.sleep(0.01)

@@ -37,7 +37,7 @@ def test_images_without_calibration_or_of_another_size_are_found(tmp_path: Path)
         ([(160, 112)], ["error /cf1/camera/image images of 160x112, but the calibration is for "]),
     ],
 )
-def test_images_are_of_one_size_and_of_the_calibrated(
+def test_images_of_other_sizes_than_the_calibration_are_found(
     tmp_path: Path, sizes: list[tuple[int, int]], said: list[str]
 ) -> None:
     def fill(write: Write) -> None:
@@ -89,7 +89,7 @@ def test_images_are_of_one_size_and_of_the_calibrated(
         ),
     ],
 )
-def test_a_calibration_that_no_camera_has_is_found(
+def test_implausible_calibration_is_found(
     tmp_path: Path, numbers: dict[str, Any], finding: str
 ) -> None:
     def fill(write: Write) -> None:

@@ -22,7 +22,7 @@ def find_clock_findings(times: dict[str, list[float]], **unset: int) -> list[tup
     return list(check_clocks(seen))  # type: ignore[arg-type]
 
 
-def test_robots_that_touch_or_overlap_share_a_time() -> None:
+def test_spans_that_touch_or_overlap_share_a_time() -> None:
     for start_s, apart in ((5, False), (10, False), (10.5, True)):
         found = find_clock_findings(
             {"/cf1/height": [1, 10], "/cf2/height": [start_s, 20], "/cf1/x": [2, 3]}
@@ -44,7 +44,7 @@ def test_the_gap_is_from_the_end_of_one_to_the_start_of_the_other() -> None:
     ]
 
 
-def test_a_topic_apart_from_all_others_of_its_robot_is_named() -> None:
+def test_topic_that_shares_no_time_with_its_robot_is_named() -> None:
     found = find_clock_findings(
         {"/cf1/height": [1, 5], "/cf1/velocity": [30, 40], "/cf1/range/cf2": [3, 20]}
     )

@@ -35,12 +35,12 @@ def write_sensors(folder: Path, **columns: np.ndarray) -> Path:
     return path
 
 
-def test_a_plain_flight_is_not_doubted(tmp_path: Path) -> None:
+def test_normal_flight_gives_no_doubt(tmp_path: Path) -> None:
     assert find_doubts(write_sensors(tmp_path)) == []
 
 
 @pytest.mark.parametrize("beside_m", [0.0, 0.02])
-def test_a_range_that_is_the_height_is_doubted(beside_m: float, tmp_path: Path) -> None:
+def test_range_that_repeats_the_height_is_doubted(beside_m: float, tmp_path: Path) -> None:
     apart = MOVING_M + beside_m + RNG.normal(0, 0.005, 400)
     (found,) = find_doubts(write_sensors(tmp_path, apart=apart))
     assert "/cf1/range/cf2 100% of the ranges are the robot's own height" in found
@@ -51,7 +51,7 @@ def test_a_range_that_never_changes_is_doubted(tmp_path: Path) -> None:
     assert found == "/cf1/range/cf2 all ranges are 2 m. Does the sensor measure?"
 
 
-def test_ranges_near_the_height_for_a_while_are_ranges(tmp_path: Path) -> None:
+def test_ranges_near_the_height_for_a_while_are_not_doubted(tmp_path: Path) -> None:
     apart = np.where(TIME_S < 6, MOVING_M, MOVING_M + TIME_S)
     assert find_doubts(write_sensors(tmp_path, apart=apart)) == []
 
@@ -129,7 +129,7 @@ def test_a_frozen_camera_is_found(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("level", "what"), [(1, "black"), (250, "of one colour")])
-def test_a_camera_that_sees_nothing_is_found(level: int, what: str, tmp_path: Path) -> None:
+def test_covered_camera_is_found(level: int, what: str, tmp_path: Path) -> None:
     covered = [encode_jpeg(draw_stripes(level, 1.0, 0)) for _ in range(50)]
     (found,) = find_image_doubts(tmp_path, covered, "jpeg")
     assert f"images looked at are {what}. Is it covered?" in found
@@ -156,7 +156,7 @@ def find_label_doubts(
 
 
 @pytest.mark.heavy
-def test_labels_that_no_image_has_are_doubted(tmp_path: Path) -> None:
+def test_labels_with_wrong_units_or_boxes_are_doubted(tmp_path: Path) -> None:
     uv = RNG.uniform((12, 12), (52, 36), (30, 2))
     depth_m = RNG.uniform(0.5, 3, 30)
     box = np.column_stack([uv - 5, uv + 5])

@@ -97,7 +97,7 @@ def test_velocity_in_another_frame_is_found(tmp_path: Path) -> None:
         assert len(found) == 1 and words in found[0] and "/cf1/velocity" in found[0], words
 
 
-def test_a_signal_is_in_order_and_finite_and_has_each_time_once() -> None:
+def test_signal_is_sorted_and_finite_without_repeated_times() -> None:
     parts = [np.array([[3.0, 30], [1, 10]]), np.array([[1.0, 11], [2, np.nan], [4, 40]])]
     time_s, values = _build_signal(parts)
     assert time_s.tolist() == [1, 3, 4]
@@ -113,7 +113,7 @@ def build_poses(time_s: NDArray[np.float64], **angles: float) -> NDArray[np.floa
     return np.column_stack([2 * time_s, -time_s, euler_to_quaternion(turn)])
 
 
-def test_motion_is_the_slope_of_poses() -> None:
+def test_motion_is_the_derivative_of_the_poses() -> None:
     time_s = np.arange(0, 4.01, 0.02)
     found = _derive_motion(time_s, build_poses(time_s, roll=0.1, pitch=-0.2, yaw=1.5))
     for name, wanted in (("velocity", [2.0, -1.0]), ("yaw rate", [1.5])):
@@ -125,7 +125,7 @@ def test_motion_is_the_slope_of_poses() -> None:
     assert values == pytest.approx(np.outer(at, [0.1, -0.2, 1.5]), abs=1e-6)
 
 
-def test_motion_is_not_known_where_poses_are_rare_or_no_turns() -> None:
+def test_motion_is_unknown_where_poses_are_sparse_or_not_rotations() -> None:
     time_s = np.concatenate([np.arange(0, 3, 0.02), np.arange(5, 8, 0.02)])
     at = _derive_motion(time_s, build_poses(time_s))["velocity"][0]
     assert not ((at > 3.25) & (at < 4.75)).any()
@@ -176,7 +176,7 @@ def test_slow_robot_gives_no_finding(speed_mps: float, count: int) -> None:
 
 
 @pytest.mark.parametrize(("share", "count"), [(0.55, 0), (0.45, 0)])
-def test_a_velocity_half_like_or_like_no_other_is_not_doubted(share: float, count: int) -> None:
+def test_velocity_with_weak_correlation_is_not_doubted(share: float, count: int) -> None:
     time_s, motion = build_motion(1.0)
     forward = motion["velocity"][1][:, 0]  # type: ignore[index]
     other = 2**0.5 * np.cos(4 * np.pi * time_s)
@@ -195,7 +195,7 @@ def test_velocity_that_matches_another_frame_is_doubted(share: float, count: int
 
 
 @pytest.mark.parametrize(("tilt", "count"), [(0.019, 0), (0.021, 1)])
-def test_tilts_under_a_fiftieth_are_not_doubted(tilt: float, count: int) -> None:
+def test_tilts_under_0_02_rad_are_not_doubted(tilt: float, count: int) -> None:
     time_s, motion = build_motion(1.0, tilt)
     said = -np.column_stack([motion["angles"][1][:, :2], 0 * time_s]) + 5.0  # type: ignore[index]
     found = list(_check_attitude((time_s, said), motion))  # type: ignore[arg-type]

@@ -47,7 +47,7 @@ def test_statistics_equal_those_of_all_times(
         assert found.compute_median_step_ns(over) == np.median(steps[over:])
 
 
-def test_equal_steps_and_steps_that_differ_are_held_in_little_memory() -> None:
+def test_regular_and_irregular_steps_take_little_memory() -> None:
     count = 4 * topic_times.BLOCK_STEPS + 1
     for steps, most_bytes in ((np.full(count, MS), 100), (rng.integers(0, MS, count), 4 * count)):
         found = TopicTimes.of(add_up(steps))

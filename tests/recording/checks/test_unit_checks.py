@@ -25,7 +25,7 @@ def find_doubts(topic: str, name: str, values: np.ndarray) -> list[tuple[str, st
         ("/cf1/attitude", "roll_rad", 0.05),
     ],
 )
-def test_thousandths_are_doubted_and_the_unit_is_not(topic: str, name: str, usual: float) -> None:
+def test_values_a_thousand_times_too_large_are_doubted(topic: str, name: str, usual: float) -> None:
     values = usual * np.random.default_rng(1).uniform(-1, 1, 200)
     assert find_doubts(topic, name, values) == []
     ((where, text),) = find_doubts(topic, name, 1000 * values)
@@ -41,7 +41,7 @@ def test_unit_finding_needs_more_than_a_tenth_of_the_values() -> None:
     assert text == "height_m: 11% of the values are over 30 m. Are they mm or cm?"
 
 
-def test_single_values_that_no_flight_gives_are_found() -> None:
+def test_implausible_single_values_are_found() -> None:
     values = np.full(100, 0.5)
     values[3] = -1e30
     ((_, text),) = find_doubts("/cf1/velocity", "vx_mps", values)
@@ -78,7 +78,7 @@ def test_sensor_periods_out_of_range_are_found() -> None:
     assert find_period(times[:19] * 1000) == []
 
 
-def test_the_period_of_times_that_go_back_is_that_of_the_sorted_ones() -> None:
+def test_period_of_unsorted_times_is_that_of_the_sorted_times() -> None:
     times = np.arange(100) * 10_000_000
     assert find_period(np.random.default_rng(0).permutation(times)) == []
     assert find_period(times[::-1] * 1000) == find_period(times * 1000) != []

@@ -161,7 +161,7 @@ def test_recordings_whose_channels_have_the_same_numbers_are_merged(tmp_path: Pa
     assert len(read_channel_topics(out)) == 2
 
 
-def test_index_with_a_wrong_channel_is_damage(flight: Path, tmp_path: Path) -> None:
+def test_message_index_of_a_wrong_channel_is_damage(flight: Path, tmp_path: Path) -> None:
     bad, data = tmp_path / "bad.mcap", bytearray(flight.read_bytes())
     chunk = read_chunk_indexes(flight)[1]
     first, second = sorted(chunk.message_index_offsets.values())[:2]
@@ -172,7 +172,7 @@ def test_index_with_a_wrong_channel_is_damage(flight: Path, tmp_path: Path) -> N
         rewrite(bad, tmp_path / "out.mcap", MADE, without=())
 
 
-def test_recovering_keeps_whole_chunks_as_they_are(flight: Path, tmp_path: Path) -> None:
+def test_recovering_copies_undamaged_chunks_unchanged(flight: Path, tmp_path: Path) -> None:
     cut, out = tmp_path / "cut.mcap", tmp_path / "out.mcap"
     last = max(c.chunk_start_offset for c in read_chunk_indexes(flight))
     cut.write_bytes(flight.read_bytes()[:last])
@@ -197,7 +197,7 @@ def test_damaged_chunk_is_detected_while_copying(flight: Path, tmp_path: Path) -
         assert not (tmp_path / "out.mcap").exists()
 
 
-def test_small_chunks_of_a_live_recording_are_put_together(tmp_path: Path) -> None:
+def test_small_chunks_of_a_live_recording_are_joined(tmp_path: Path) -> None:
     path, out = tmp_path / "live.mcap", tmp_path / "out.mcap"
     with RecordingWriter(path, MADE) as sink:
         for k in range(500):

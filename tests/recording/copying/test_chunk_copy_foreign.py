@@ -75,7 +75,7 @@ def test_chunks_of_other_writers_are_copied_in_their_compression(
     )
 
 
-def test_a_chunk_that_defines_a_channel_otherwise_is_not_copied(tmp_path: Path) -> None:
+def test_chunk_that_contradicts_the_summary_is_not_copied(tmp_path: Path) -> None:
     def fill(writer: Writer, schema: int) -> None:
         channel = writer.register_channel("/cf1/height", "protobuf", schema)
         for k in range(5_000):

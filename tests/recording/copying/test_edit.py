@@ -224,7 +224,7 @@ def test_span_that_ends_before_it_begins_is_refused(tmp_path: Path, flight: Path
         stage.run(flight, tmp_path / "b.mcap", stage.Settings(from_s=20, to_s=10))
 
 
-def test_a_recording_is_called_mcap(tmp_path: Path) -> None:
+def test_name_of_a_new_recording_must_end_in_mcap(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match=r"out is not named like a recording\. Use out\.mcap"):
         RecordingWriter(tmp_path / "out", Provenance("test"))
     assert not [*tmp_path.iterdir()]

@@ -95,7 +95,7 @@ def test_compressed_chunk_has_a_message_index_and_resets_the_builder() -> None:
 
 
 @pytest.mark.parametrize("chunk_bytes", [400, 2000])
-def test_blocks_are_appended_as_messages_are(
+def test_appended_batches_equal_appended_messages(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, chunk_bytes: int
 ) -> None:
     # The smaller size is less than a topic's definition takes, and must still make progress.
@@ -119,7 +119,7 @@ def test_blocks_are_appended_as_messages_are(
 
 
 @pytest.mark.parametrize("wrong", [(-5, 1), (1, -5)])
-def test_a_block_with_a_negative_time_is_refused_by_topic(
+def test_batch_with_a_negative_time_is_refused_by_topic(
     tmp_path: Path, wrong: tuple[int, int]
 ) -> None:
     channels = {k: Channel(f"/{k}", "dmrl.v1.Height", serialize_schema("Height")) for k in (1, 2)}

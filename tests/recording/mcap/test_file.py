@@ -65,13 +65,15 @@ def test_hashed_input_must_stay_unchanged_until_an_output_is_done(tmp_path: Path
         (MAGIC + b"much more" + MAGIC[:-1], "is cut short"),
     ],
 )
-def test_a_file_begins_and_ends_as_a_recording(tmp_path: Path, content: bytes, words: str) -> None:
+def test_file_without_both_magic_numbers_is_refused(
+    tmp_path: Path, content: bytes, words: str
+) -> None:
     (tmp_path / "a.mcap").write_bytes(content)
     with pytest.raises(RecordingError, match=words), open_mcap(tmp_path / "a.mcap"):
         pass
 
 
-def test_no_read_goes_beyond_the_end(tmp_path: Path) -> None:
+def test_reading_beyond_the_end_is_an_error(tmp_path: Path) -> None:
     (tmp_path / "a.mcap").write_bytes(MAGIC + b"12" + MAGIC)
     with open_mcap(tmp_path / "a.mcap") as stream:
         assert (stream.tell(), stream.size) == (0, 18)

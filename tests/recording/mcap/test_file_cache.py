@@ -25,7 +25,7 @@ def set_modification_time(path: Path, second: int) -> None:
     os.utime(path, (second, second))
 
 
-def test_a_summary_is_not_made_again_while_the_file_is_the_same(tmp_path: Path) -> None:
+def test_summary_is_cached_while_the_file_is_unchanged(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     write_heights(path, 3)
     set_modification_time(path, 1_000_000_000)
@@ -43,7 +43,7 @@ def test_rewritten_file_is_read_again(tmp_path: Path) -> None:
     assert read_summary(path).count == 5
 
 
-def test_a_file_of_this_second_is_always_read_again(tmp_path: Path) -> None:
+def test_recent_file_is_not_cached(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     write_heights(path, 3)
     # A time in the future keeps the file recent on a slow machine too.

@@ -44,13 +44,14 @@ def overwrite(path: Path, at: int, values: bytes) -> None:
 
 
 def read_indexes(path: Path) -> None:
+    """Read every message index of a file."""
     with open_mcap(path) as stream:
         section = read_summary_section(stream)
         assert section is not None
         list(iter_index_times(stream, section))
 
 
-def test_every_chunk_gives_its_times(tmp_path: Path) -> None:
+def test_times_are_read_from_every_chunk(tmp_path: Path) -> None:
     write(tmp_path / "a.mcap")
     assert read_time_spans(tmp_path / "a.mcap") == {"/a": (0, 100), "/b": (10, 110)}
     found = read_log_times(tmp_path / "a.mcap", ["/b"])

@@ -32,7 +32,7 @@ def parse_both(raw: bytes, at: int) -> list[IndexEntries | str]:
     return out
 
 
-def test_a_single_record_is_parsed_as_many_are() -> None:
+def test_single_record_is_parsed_like_many() -> None:
     for entries in parse_both(build_index() + b"more", AT):
         assert isinstance(entries, IndexEntries)
         assert [one.tolist() for one in entries] == [[3, 3], [40, 20], [9, 71], [2]]
@@ -51,5 +51,5 @@ def test_a_single_record_is_parsed_as_many_are() -> None:
         (build_index(size=31), AT, "message index of channel 3 is wrong"),
     ],
 )
-def test_a_single_record_is_refused_as_many_are(raw: bytes, at: int, why: str) -> None:
+def test_single_record_is_refused_like_many(raw: bytes, at: int, why: str) -> None:
     assert parse_both(raw, at) == [why, why]

@@ -37,6 +37,7 @@ def read_row(message: Any, *, top: bool = True) -> Any:
 
 
 def _value(message: Any, field: FieldDescriptor) -> Any:
+    """Return the value of a field as the table has it."""
     held, inner = getattr(message, field.name), field.message_type
     if inner is not None and inner.GetOptions().map_entry:
         entries = [

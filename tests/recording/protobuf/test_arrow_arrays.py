@@ -28,7 +28,7 @@ sys.exit("pandas" in sys.modules)
 
 
 @pytest.mark.parametrize("values", VALUES, ids=lambda values: f"{values.dtype}-{len(values)}")
-def test_values_are_those_of_pyarrow(values: NDArray[np.generic]) -> None:
+def test_converted_values_equal_those_of_pyarrow(values: NDArray[np.generic]) -> None:
     column = to_arrow(values)
     assert column.equals(pa.array(values))
     for back in (to_numpy(column), to_numpy(pa.chunked_array([column]))):
@@ -44,7 +44,7 @@ def test_null_numbers_are_nan() -> None:
     assert np.isnan(to_numpy(pa.array([1, None]))[1])
 
 
-def test_texts_are_matched() -> None:
+def test_match_text_finds_equal_texts() -> None:
     texts = pa.array(["motion", "", "mo", "motion"])
     assert match_text(texts, "motion").tolist() == [True, False, False, True]
     assert match_text(pa.chunked_array([texts]), "").tolist() == [False, True, False, False]

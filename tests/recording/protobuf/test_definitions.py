@@ -128,7 +128,7 @@ def test_missing_imports_of_definitions_are_accepted(tmp_path: Path) -> None:
     assert table["far"].to_pylist() == [b"\x08\x07"] * 3  # its type is defined nowhere
 
 
-def test_two_files_may_define_one_type(tmp_path: Path) -> None:
+def test_type_defined_in_two_files_is_accepted(tmp_path: Path) -> None:
     one, two = build_file("a.proto"), build_file("dir/a.proto", dependency=["a.proto"])
     for file in (one, two):
         add_message(file, "P", x=F.TYPE_DOUBLE)
@@ -140,7 +140,7 @@ def test_two_files_may_define_one_type(tmp_path: Path) -> None:
     assert dmrl.open(path)["/x"].to_arrow()["p"].to_pylist() == [{"x": 2.5}]
 
 
-def test_a_topic_whose_type_grows_has_the_columns_of_all(
+def test_topic_whose_type_grows_has_the_columns_of_every_version(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     sent: list[Sent] = []
@@ -238,7 +238,7 @@ def test_invalid_definition_gives_one_line_error(tmp_path: Path) -> None:
         assert "damaged" not in str(e.value)
 
 
-def test_a_topic_that_is_no_protobuf_spares_the_tables_of_others(tmp_path: Path) -> None:
+def test_topic_without_protobuf_does_not_prevent_tables_of_others(tmp_path: Path) -> None:
     file = build_file("m.proto")
     add_message(file, "M", x=F.TYPE_DOUBLE)
     data = build_class("my.M", file)(x=1.5).SerializeToString()
@@ -277,7 +277,7 @@ def test_an_absent_message_with_a_list_in_it_keeps_its_row(tmp_path: Path) -> No
     assert len(dmrl.open(path)["/x"].to_pandas()) == 3
 
 
-def test_a_type_wider_than_a_table_is_text(tmp_path: Path) -> None:
+def test_message_with_too_many_columns_becomes_json(tmp_path: Path) -> None:
     """Ten types with ten fields of the previous type would be a table of 10**10 columns."""
     file = build_file("m.proto")
     add_message(file, "T0", a=F.TYPE_INT32)

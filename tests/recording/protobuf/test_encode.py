@@ -84,7 +84,7 @@ def test_numbers_that_are_not_whole_or_too_large_are_refused(rows: list[float]) 
         encode(message_class("GridMap").DESCRIPTOR, {"rows": rows}, 2)
 
 
-def test_columns_become_the_recording_that_messages_become(tmp_path: Path) -> None:
+def test_recording_of_columns_equals_that_of_messages(tmp_path: Path) -> None:
     times = np.sort(RNG.integers(0, 10**12, 9000))
     roll = RNG.normal(size=9000)
     with RecordingWriter(tmp_path / "a.mcap", Provenance("test")) as sink:
@@ -98,7 +98,7 @@ def test_columns_become_the_recording_that_messages_become(tmp_path: Path) -> No
     assert sum(1 for _ in read_raw(tmp_path / "b.mcap")) == 9000
 
 
-def test_columns_keep_the_rules_of_messages(tmp_path: Path) -> None:
+def test_columns_are_checked_as_messages_are(tmp_path: Path) -> None:
     with RecordingWriter(tmp_path / "a.mcap", Provenance("test")) as sink:
         times = np.array([5, 7])
         sink.write_columns(

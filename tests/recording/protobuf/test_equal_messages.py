@@ -59,7 +59,7 @@ rows = st.fixed_dictionaries({}, optional={name: values for name, (_, values) in
 
 @given(st.lists(rows, min_size=2, max_size=6))
 @pytest.mark.heavy
-def test_what_is_decoded_is_what_google_s_parser_reads(contents: list[dict[str, Any]]) -> None:
+def test_decoded_values_equal_google_protobuf(contents: list[dict[str, Any]]) -> None:
     messages = [FIXED(**row) for row in contents]
     at = lay_out([message.SerializeToString() for message in messages])
     alike = decode_equal(*at, FIELDS)
@@ -75,7 +75,7 @@ def test_fields_that_only_another_column_needs_are_skipped() -> None:
     assert alike is not None and {k: v.tolist() for k, v in alike.items()} == {"y": [2, 3, 4]}
 
 
-def test_of_a_field_that_occurs_twice_the_last_counts() -> None:
+def test_last_value_of_a_field_that_occurs_twice_is_used() -> None:
     once = [FIXED(x=k + 1.0).SerializeToString() for k in range(4)]
     alike = decode_equal(*lay_out([once[0] + once[1], once[2] + once[3]]), FIELDS)
     assert alike is not None and alike["x"].tolist() == [2.0, 4.0]
@@ -93,13 +93,13 @@ def test_of_a_field_that_occurs_twice_the_last_counts() -> None:
         pytest.param([b"\x09" + bytes(8)], id="one message"),
     ],
 )
-def test_messages_that_differ_or_are_wrong_are_left_to_the_general_decoder(
+def test_unequal_or_damaged_messages_are_left_to_the_general_decoder(
     parts: list[bytes],
 ) -> None:
     assert decode_equal(*lay_out(parts), FIELDS) is None
 
 
-def test_messages_at_several_distances_are_left_to_the_general_decoder() -> None:
+def test_irregularly_spaced_messages_are_left_to_the_general_decoder() -> None:
     data, start, end = lay_out([FIXED(x=k + 1).SerializeToString() for k in range(4)])
     some = [0, 1, 3]
     assert decode_equal(data, start[some], end[some], FIELDS) is None
