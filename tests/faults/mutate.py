@@ -37,23 +37,23 @@ def mutate_record(data: bytes, rng: np.random.Generator) -> bytes:
 
     The record may lie within a chunk.
     """
-    records, starts = parts.taken_apart(data, len(parts.MAGIC), len(data) - len(parts.MAGIC))
+    records, starts = parts.split_records(data, len(parts.MAGIC), len(data) - len(parts.MAGIC))
     if not records:
         return mutate(data, rng)
-    sums, moved = parts.sums_of(records), dict[int, int]()
+    sums, moved = parts.compute_crcs(records), dict[int, int]()
     placed = list(zip(records, starts, strict=True))
     chosen = _choose_record(records, rng)
     (opcode, body), place = placed[chosen]
-    inner = parts.chunk_parts(body) if opcode == Opcode.CHUNK and rng.random() < 0.8 else None
+    inner = parts.unpack_chunk(body) if opcode == Opcode.CHUNK and rng.random() < 0.8 else None
     if inner is not None:
         kind, unpacked = inner
         changed, moved = _mutate_chunk(unpacked, rng)
         if rng.random() < 0.1:
             kind = ("zstd", "lz4", "")[int(rng.integers(3))]
-        placed[chosen] = (opcode, parts.chunk_of(body, kind, changed)), place
+        placed[chosen] = (opcode, parts.pack_chunk(body, kind, changed)), place
     else:
         placed[chosen : chosen + 1] = _change_record(placed[chosen], rng)
-    return parts.put_together(placed, moved, sums)
+    return parts.join_records(placed, moved, sums)
 
 
 def _choose_record(records: list[parts.Record], rng: np.random.Generator) -> int:
@@ -81,7 +81,7 @@ def _change_record(
 
 def _mutate_chunk(data: bytes, rng: np.random.Generator) -> tuple[bytes, dict[int, int]]:
     """Damage one record of a chunk; return all records and the new offset of each old one."""
-    records, starts = parts.taken_apart(data)
+    records, starts = parts.split_records(data)
     if not records:
         return mutate(data, rng), {}
     placed = list(zip(records, starts, strict=True))
@@ -90,7 +90,7 @@ def _mutate_chunk(data: bytes, rng: np.random.Generator) -> tuple[bytes, dict[in
     out, moved = bytearray(), {}
     for record, place in placed:
         moved[place] = len(out)
-        out += parts.written(record)
+        out += parts.pack_record(record)
     moved.pop(-1, None)
     return bytes(out), moved
 

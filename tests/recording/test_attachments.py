@@ -142,7 +142,7 @@ def test_two_channels_of_one_topic_are_one_topic(indexed: bool, tmp_path: Path) 
 @pytest.mark.parametrize("indexed", [True, False])
 @pytest.mark.parametrize("publish_ns", [2**64 - 1, 2**63])
 def test_time_beyond_int64_is_reported(publish_ns: int, indexed: bool, tmp_path: Path) -> None:
-    """The reason: read from a message index as int64, such a time is negative."""
+    """Read from a message index as int64, such a time would be negative."""
     path = tmp_path / "a.mcap"
     with path.open("wb") as stream:
         writer = Writer(stream, index_types=IndexType.ALL if indexed else IndexType.NONE)

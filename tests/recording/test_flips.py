@@ -174,7 +174,7 @@ def test_messages_of_a_damaged_chunk_are_counted_even_without_the_end(tmp_path: 
 
 
 def test_checksums_copied_by_other_programs_are_ignored(tmp_path: Path) -> None:
-    """`mcap filter --include-metadata` copies the metadata with dmrl's checksums."""
+    """`mcap filter --include-metadata` copies dmrl's checksums, which do not fit its output."""
     path, copy = write_small_recording(tmp_path / "a.mcap"), tmp_path / "b.mcap"
     with path.open("rb") as source, copy.open("wb") as stream:
         reader, writer = make_reader(source), Writer(stream, chunk_size=90)

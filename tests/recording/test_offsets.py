@@ -37,7 +37,7 @@ def replace_offset(data: bytes, opcode: int, at: int, offset: int) -> bytes:
     """
     end = len(data) - FOOTER
     start = struct.unpack_from("<Q", data, end + 9)[0]
-    records, starts = parts.taken_apart(data, start, end)
+    records, starts = parts.split_records(data, start, end)
     first = next(s for (kind, _), s in zip(records, starts, strict=True) if kind == opcode)
     out = bytearray(data)
     struct.pack_into("<Q", out, first + 9 + at, offset)

@@ -160,4 +160,6 @@ def test_step_of_a_recipe_writes_only_in_the_pipeline_folder(
     assert run_command(box, capsys, "run", recipe, "--out", box.out / "a") == 1
     assert list(box.out.iterdir()) == []
     recipe.write_text(f'kind = "pipeline"\n{step}"honest"\n')
-    assert run_command(box, capsys, "run", recipe, "--out", box.out / "a") == 0  # so it is the name
+    assert (
+        run_command(box, capsys, "run", recipe, "--out", box.out / "a") == 0
+    )  # a valid name succeeds

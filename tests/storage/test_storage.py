@@ -26,7 +26,7 @@ from dmrl.recording.provenance_inputs import build_input, hash_file
 from dmrl.storage import RemotePath, to_path
 from dmrl.storage.remote import UNFINISHED_MARK
 
-from ..pipeline.test_batch import record
+from ..pipeline.test_batch import write_recording
 from .conftest import forget_filesystems
 
 pytestmark = pytest.mark.filterwarnings("ignore")  # from botocore and aiohttp
@@ -75,7 +75,7 @@ def test_bucket_urls_become_paths_and_other_names_stay_local() -> None:
 def test_command_between_buckets_equals_local_output(
     lab: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    source = record(tmp_path / "a.mcap")
+    source = write_recording(tmp_path / "a.mcap")
     lab.put_file(str(source), "lab/one/a.mcap")
     run_command(capsys, 0, "trim", source, tmp_path / "b.mcap", "--to-s", 1)
     run_command(capsys, 0, "trim", "s3://lab/one/a.mcap", "s3://lab/one/b.mcap", "--to-s", 1)
@@ -91,7 +91,7 @@ def test_commands_work_on_folders_in_a_bucket(
     lab: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for name in ("a.mcap", "b/c.mcap", ".hidden/d.mcap"):
-        lab.put_file(str(record(tmp_path / name)), f"lab/many/{name}")
+        lab.put_file(str(write_recording(tmp_path / name)), f"lab/many/{name}")
     words = ("trim", "s3://lab/many", "s3://lab/cut", "--to-s", 1, "--workers", 1)
     assert run_command(capsys, 0, *words).out.count("made") == 2
     assert sorted(lab.find("lab/cut")) == ["lab/cut/a.mcap", "lab/cut/b/c.mcap"]
@@ -221,7 +221,7 @@ def test_a_dataset_in_a_bucket_grows_and_nothing_else_is_written(
 def test_bucket_errors_are_one_line(
     lab: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    lab.put_file(str(record(tmp_path / "good.mcap")), "lab/wrong/good.mcap")
+    lab.put_file(str(write_recording(tmp_path / "good.mcap")), "lab/wrong/good.mcap")
     lab.pipe_file("lab/wrong/text.mcap", b"no recording")
     for words, why in (
         (("info", "s3://nobody/a.mcap"), "there is no such bucket"),

@@ -43,9 +43,8 @@ def test_batch_operations_keep_messages_intact(one: list[Row], other: list[Row])
     records, at = first.copy_records()
     bodies = [records[a + MESSAGE_PREFIX_BYTES : b].tobytes() for a, b in pairwise(at.tolist())]
     assert bodies == [payload for *_, payload in one]
-    assert list(first.sort_by_time().iter_rows()) == sorted(
-        one, key=lambda row: row[1]
-    )  # stable, as this is
+    # Like `sorted`, sorting a batch keeps the order of messages at equal times.
+    assert list(first.sort_by_time().iter_rows()) == sorted(one, key=lambda row: row[1])
     late = sorted(one, key=lambda row: (row[1], row[0] == 2))
     assert list(first.sort_by_time(last=[2]).iter_rows()) == late
     odd = np.array([row[0] % 2 == 1 for row in one], bool)
