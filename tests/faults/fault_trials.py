@@ -109,7 +109,10 @@ class FaultTrials:
 
     @property
     def done(self) -> bool:
-        """Whether the output is complete: the same bytes as without faults, if the workload has."""
+        """Whether the output is complete.
+
+        It has the bytes of the run without faults, or about as many if these always differ.
+        """
         found = read_contents(self.out) if self.out.exists() else {}
         # Killed between linking a file and removing its partial name, it has both names.
         twins = {name for name in found if found.get(f"{name}.partial") == found[name]}

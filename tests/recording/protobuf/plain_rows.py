@@ -3,8 +3,22 @@
 import json
 from typing import Any
 
+import numpy as np
 from google.protobuf import json_format
 from google.protobuf.descriptor import Descriptor, FieldDescriptor
+
+from dmrl.recording.protobuf.decode import decode
+
+
+def decode_rows(parts: list[bytes], kind: Descriptor) -> list[dict[str, Any]]:
+    """Decode serialized messages in bulk and return a dictionary for each."""
+    end = np.cumsum([len(p) for p in parts], dtype=np.int64)
+    start = end - np.array([len(p) for p in parts], np.int64)
+    got = decode(np.frombuffer(b"".join(parts), np.uint8), start, end, kind)
+    for column in got.values():
+        column.validate(full=True)
+    lists = {name: column.to_pylist() for name, column in got.items()}
+    return [{name: lists[name][k] for name in lists} for k in range(len(parts))]
 
 
 def contains_itself(kind: Descriptor, within: tuple[str, ...] = ()) -> bool:

@@ -19,6 +19,8 @@ from dmrl.messages import message_class
 from dmrl.recording.protobuf.decode import decode
 from dmrl.recording.protobuf.wire_format import WireError, decode_varints
 
+from .plain_rows import decode_rows
+
 F = FieldDescriptorProto
 TYPES = {
     "double": (F.TYPE_DOUBLE, st.floats(allow_nan=False)),
@@ -90,17 +92,9 @@ def to_plain(value: Any) -> Any:
     return out
 
 
-def decode_rows(messages: list[Any]) -> list[dict[str, Any]]:
+def decode_messages(messages: list[Any]) -> list[dict[str, Any]]:
     """Serialize messages, decode them in bulk, and return a dictionary for each."""
-    parts = [m.SerializeToString() for m in messages]
-    end = np.cumsum([len(p) for p in parts], dtype=np.int64)
-    start = end - np.array([len(p) for p in parts], np.int64)
-    data = np.frombuffer(b"".join(parts), np.uint8)
-    got = decode(data, start, end, messages[0].DESCRIPTOR)
-    for column in got.values():
-        column.validate(full=True)
-    lists = {name: column.to_pylist() for name, column in got.items()}
-    return [{name: lists[name][k] for name in lists} for k in range(len(messages))]
+    return decode_rows([m.SerializeToString() for m in messages], messages[0].DESCRIPTOR)
 
 
 @pytest.mark.heavy
@@ -108,7 +102,7 @@ def decode_rows(messages: list[Any]) -> list[dict[str, Any]]:
 @given(st.lists(contents(), min_size=1, max_size=5))
 def test_bulk_decoding_equals_google_protobuf(values: list[dict[str, Any]]) -> None:
     messages = [OUTER(**v) for v in values]
-    assert decode_rows(messages) == [to_plain(m) for m in messages]
+    assert decode_messages(messages) == [to_plain(m) for m in messages]
 
 
 @settings(max_examples=100)
@@ -127,7 +121,7 @@ def test_labels_with_and_without_peers() -> None:
         message_class("PeerLabels")(),
         message_class("PeerLabels")(peers=[label(peer="cf2"), label(peer="cf3", u_px=3.5)]),
     ]
-    assert decode_rows(values) == [to_plain(v) for v in values]
+    assert decode_messages(values) == [to_plain(v) for v in values]
 
 
 def test_a_value_beyond_its_message_is_an_error() -> None:

@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 import pandas
 import pytest
-from google.protobuf.descriptor import Descriptor
 from google.protobuf.descriptor_pb2 import (
     FieldDescriptorProto,
     FileDescriptorProto,
@@ -18,26 +17,14 @@ from mcap.writer import Writer
 
 import dmrl
 from dmrl.errors import RecordingError
-from dmrl.recording.protobuf.decode import decode
 from dmrl.recording.protobuf.definitions import build_type
 from dmrl.stages.convert import Settings, run
 from dmrl.terminal.left_out import count_left_out
 
 from .definitions_of_any_shape import iter_definitions
-from .plain_rows import from_table, read_row
+from .plain_rows import decode_rows, from_table, read_row
 
 F = FieldDescriptorProto
-
-
-def decode_rows(parts: list[bytes], kind: Descriptor) -> list[dict[str, Any]]:
-    """Decode serialized messages in bulk and return a dictionary for each."""
-    end = np.cumsum([len(p) for p in parts], dtype=np.int64)
-    start = end - np.array([len(p) for p in parts], np.int64)
-    got = decode(np.frombuffer(b"".join(parts), np.uint8), start, end, kind)
-    for column in got.values():
-        column.validate(full=True)
-    lists = {name: column.to_pylist() for name, column in got.items()}
-    return [{name: lists[name][k] for name in lists} for k in range(len(parts))]
 
 
 def compare_decoders(seeds: range) -> int:
