@@ -68,14 +68,14 @@ class FaultTrials:
         self.found.append(self.read())
         self._inputs = (inputs, read_contents(inputs))
 
-    def clear_folder(self) -> None:
+    def clear(self) -> None:
         """Restore the disk to its first state."""
         clear_folder(self.folder)
         if self.work.before:
             self.disk.prepare(self.work.name, self.folder, self.work.out)
 
     def read(self) -> dict[str, object]:
-        """What others find in the output."""
+        """Return what each other reader finds in the output."""
         return {} if self.work.reads is None else self.work.reads(self.out)
 
     def run(
@@ -85,7 +85,7 @@ class FaultTrials:
         kill_s: float | None = None,
         most_bytes: int | None = None,
     ) -> Ending:
-        """How the work ended."""
+        """Run the workload and return how it ended."""
         given = (self.work.name, self.folder, self.work.out, fault)
         try:
             return self.disk.run(*given, kill_s=kill_s, most_bytes=most_bytes)

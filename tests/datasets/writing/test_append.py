@@ -39,7 +39,7 @@ def read_contents(folder: Path) -> dict[str, bytes]:
 
 
 def read_stamps(folder: Path) -> dict[str, tuple[int, int]]:
-    """Return modification time, ns, and inode of every file, which show whether it was rewritten."""
+    """Return modification time, ns, and inode of every file, which show whether it was written."""
     return {
         p.relative_to(folder).as_posix(): (p.stat().st_mtime_ns, p.stat().st_ino)
         for p in folder.rglob("*")
