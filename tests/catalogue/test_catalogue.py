@@ -186,13 +186,13 @@ def test_interrupted_index_keeps_finished_rows(
 ) -> None:
     real = index.iter_results
 
-    def stopped(*given: object) -> object:
+    def iter_two_rows(*given: object) -> object:
         for k, one in enumerate(real(*given)):  # type: ignore[arg-type]
             if k == 2:
                 raise KeyboardInterrupt
             yield one
 
-    monkeypatch.setattr(index, "iter_results", stopped)
+    monkeypatch.setattr(index, "iter_results", iter_two_rows)
     with pytest.raises(KeyboardInterrupt):
         index.update(flights, workers=1)
     monkeypatch.undo()
@@ -234,16 +234,18 @@ def index_flights(flights: Path) -> Path:
 def test_the_commands_print_tables_paths_and_json(
     flights: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def said(*words: str) -> str:
+    def run_and_read(*words: str) -> str:
         assert boundary.run_to_status(lambda: app([*words], result_action="return_value")) == 0
         return capsys.readouterr().out
 
-    assert "4 recordings; 4 looked at, 0 known" in said("index", str(flights), "--workers", "1")
-    assert json.loads(said("index", str(flights), "--json"))["known"] == 3
-    assert "estimate 4 of 8, truth 4 of 4" in said("find", "camera = 'cf1'", str(flights))
-    paths = said("find", "camera = 'cf1'", str(flights), "--paths").splitlines()
+    assert "4 recordings; 4 looked at, 0 known" in run_and_read(
+        "index", str(flights), "--workers", "1"
+    )
+    assert json.loads(run_and_read("index", str(flights), "--json"))["known"] == 3
+    assert "estimate 4 of 8, truth 4 of 4" in run_and_read("find", "camera = 'cf1'", str(flights))
+    paths = run_and_read("find", "camera = 'cf1'", str(flights), "--paths").splitlines()
     assert paths == [str(flights / "a.mcap"), str(flights / "monday" / "b.mcap")]
-    found = json.loads(said("find", "error is not null", str(flights), "--json"))
+    found = json.loads(run_and_read("find", "error is not null", str(flights), "--json"))
     assert [one["recording"] for one in found["recordings"]] == ["torn.mcap"]
 
 
@@ -253,18 +255,18 @@ def test_dataset_is_made_of_query_results(
     index.update(flights, workers=1)
     out = tmp_path / "set"
 
-    def status(query: str) -> int:
+    def make_dataset(query: str) -> int:
         words = ["dataset", str(flights), str(out), "--from-index", query, "--workers", "1"]
         return boundary.run_to_status(lambda: app(words, result_action="return_value"))
 
-    assert status("camera = 'cf9'") == 1
+    assert make_dataset("camera = 'cf9'") == 1
     assert "is true of no recording" in capsys.readouterr().err
     os.utime(flights / "a.mcap")
-    assert status("camera = 'cf1'") == 1
+    assert make_dataset("camera = 'cf1'") == 1
     assert "has changed since it was indexed. Run: dmrl index" in capsys.readouterr().err
     assert not out.exists()
     index.update(flights, workers=1)
-    assert status("camera = 'cf1' and source = 'truth'") == 0
+    assert make_dataset("camera = 'cf1' and source = 'truth'") == 0
     made = json.loads((out / "provenance.json").read_text())
     assert [one["name"] for one in made["inputs"]] == ["a.mcap", "b.mcap"]
 

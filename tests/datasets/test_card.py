@@ -126,14 +126,15 @@ def test_card_can_be_written_to_another_folder(dataset: Path, tmp_path: Path) ->
 def test_card_warns_of_label_bias_exclusions_leaks_and_licence(
     record: Record, tmp_path: Path
 ) -> None:
-    def boxed(k: int) -> Any:
+    def build_boxed_peer(k: int) -> Any:
         u_px = 20.0 + k % 20
         box = [u_px - 8, 10, u_px + 8, 30]
         return build_peer(
             source="published", u_px=u_px, v_px=30.0, box_px=box, sigma_v_px=2.0 + k % 3
         )
 
-    path = record(peers=[*([boxed(k)] for k in range(30)), None], split={"train": "[[0, 10]]"})
+    peers = [*([build_boxed_peer(k)] for k in range(30)), None]
+    path = record(peers=peers, split={"train": "[[0, 10]]"})
     run([path], tmp_path / "out", Settings(split="none"))
     text = (tmp_path / "out" / "README.md").read_text()
     assert "labels from `published`: 30 of 30 have a sigma, median 0.0 px in u, 3.0 px in" in text

@@ -202,11 +202,11 @@ def test_opening_a_shard_reads_no_images_ahead_but_training_does(
     seen: list[list[str]] = []
     whole = shards._find_layout_error
 
-    def watch(table: pa.Table) -> str:
+    def record_flags(table: pa.Table) -> str:
         seen.append(read_map_flags(shard))
         return whole(table)
 
-    monkeypatch.setattr(shards, "_find_layout_error", watch)
+    monkeypatch.setattr(shards, "_find_layout_error", record_flags)
     table = open_shard(shard, None)
     assert len(seen) == 1 and "rr" in seen[0]
     assert table.num_rows and "rr" not in read_map_flags(shard)

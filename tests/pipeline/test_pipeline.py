@@ -120,10 +120,10 @@ def test_partial_files_of_a_failed_start_do_not_block_the_folder(tmp_path: Path)
 def test_os_error_in_a_step_is_no_internal_error(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    def refused(*_: object, **__: object) -> None:
+    def raise_os_error(*_: object, **__: object) -> None:
         raise OSError(errno.EIO, "Input/output error", "a.png")
 
-    monkeypatch.setattr(work, "signature_of", refused)
+    monkeypatch.setattr(work, "signature_of", raise_os_error)
     answer = work.run_job(build_job("sketch", None, {}, {}))
     assert answer == {
         "error": "cannot read or write a.png: Input/output error. Check its name, permissions and "

@@ -69,14 +69,14 @@ def run(tmp_path: Path) -> Run:
     """Return a function that runs steps in one folder, with the outputs of earlier calls."""
     (tmp_path / "unfinished").mkdir()
 
-    def runs(
+    def run_steps(
         *steps: Step, data: Path | None = None, **how: Any
     ) -> tuple[list[StepOutcome], FakePool]:
         with FakePool(**how) as crew:
             memory = BuildCache.load(tmp_path / "pipeline.json")
             return Runner(Plan(steps, ""), tmp_path, data, memory).run(crew), crew
 
-    return runs
+    return run_steps
 
 
 def test_second_run_skips_every_step(run: Run, tmp_path: Path) -> None:

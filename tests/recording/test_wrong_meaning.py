@@ -189,9 +189,9 @@ def test_ten_thousand_inconsistent_files_lose_no_message_silently(
 
     @settings(max_examples=MANY, derandomize=True, database=None)
     @given(st.integers(SAMPLE, 2**31))
-    def every(seed: int) -> None:
+    def judge_seed(seed: int) -> None:
         seen.update(check_commands(seed, *places) or ("none",))
 
-    every()
+    judge_seed()
     record_property("files by fault", dict(sorted(seen.items())))
     assert seen.keys() == {*FAULTS, "padded", "none"}

@@ -53,11 +53,11 @@ def fetched_bytes(lab: Any, monkeypatch: pytest.MonkeyPatch) -> list[int]:
     sizes: list[int] = []
     real = lab._call_s3
 
-    async def counted(method: str, *given: Any, **named: Any) -> Any:
+    async def call_and_count(method: str, *given: Any, **named: Any) -> Any:
         found = await real(method, *given, **named)
         if method == "get_object":
             sizes.append(int(found["ContentLength"]))
         return found
 
-    monkeypatch.setattr(lab, "_call_s3", counted)
+    monkeypatch.setattr(lab, "_call_s3", call_and_count)
     return sizes

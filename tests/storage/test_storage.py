@@ -161,13 +161,13 @@ def test_an_upload_that_fails_leaves_nothing(
     folder = to_path("s3://lab/torn")
     real, count = lab.put_file, []
 
-    def torn(*given: Any, **named: Any) -> None:
+    def fail_second_upload(*given: Any, **named: Any) -> None:
         count.append(given)
         if len(count) == 2:
             raise OSError("connection lost")
         real(*given, **named)
 
-    monkeypatch.setattr(lab, "put_file", torn)
+    monkeypatch.setattr(lab, "put_file", fail_second_upload)
     with pytest.raises(StorageError, match="the line is cut"), atomic_folder(folder) as here:
         (here / "a").write_bytes(b"1")
         (here / "b").write_bytes(b"2")

@@ -213,7 +213,7 @@ def dies_at_change(at: int, work: Callable[[], Any]) -> bool:
     if child == 0:
         count = 0
 
-        def counted(real: Callable[..., Any]) -> Callable[..., Any]:
+        def count_calls(real: Callable[..., Any]) -> Callable[..., Any]:
             def call(*given: Any, **named: Any) -> Any:
                 nonlocal count
                 count += 1
@@ -224,7 +224,7 @@ def dies_at_change(at: int, work: Callable[[], Any]) -> bool:
             return call
 
         for name in ("replace", "rename", "mkdir", "fsync", "unlink", "rmdir"):
-            setattr(os, name, counted(getattr(os, name)))
+            setattr(os, name, count_calls(getattr(os, name)))
         work()
         os._exit(0)
     return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 9

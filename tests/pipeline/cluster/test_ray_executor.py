@@ -231,14 +231,14 @@ def test_job_that_fails_on_one_node_is_retried_elsewhere(nodes: Nodes, tmp_path:
         run_once = crew._run_once  # type: ignore[attr-defined]
         seen: list[str] = []
 
-        def watched(*given: Any, **named: Any) -> Any:
+        def run_and_fail_first(*given: Any, **named: Any) -> Any:
             seen.append(run_once(*given, **named)["node"])
             if len(seen) == 1:
                 (tmp_path / "b.mcap").unlink()
                 return {"error": "no space left", "retry": "elsewhere", "node": seen[0]}
             return {"result": 1, "node": seen[1]}
 
-        crew._run_once = watched  # type: ignore[attr-defined]
+        crew._run_once = run_and_fail_first  # type: ignore[attr-defined]
         source = write_recording(tmp_path / "a.mcap")
         line = build_job(
             "trim", tmp_path / "b.mcap", {"recording": source}, {"to_s": 1.0}, keep=True

@@ -104,12 +104,12 @@ def test_clocks_that_share_no_time_are_found(tmp_path: Path) -> None:
         "warning /cf1/range/cf2 shares no time with the robot's other topics: 100 s between",
     ]
 
-    def two(write: Write) -> None:
+    def write_two_robots(write: Write) -> None:
         for k in range(20):
             write(k * 10**9, "/cf1/height", message_class("Height")())
             write((k + 56) * 10**9, "/cf2/height", message_class("Height")())
 
-    assert record_and_check(tmp_path / "b.mcap", two) == [
+    assert record_and_check(tmp_path / "b.mcap", write_two_robots) == [
         "warning /cf1 shares no time with /cf2: 37 s between. Separate clocks? Try: dmrl align"
     ]
 

@@ -104,12 +104,12 @@ def test_empty_index_of_another_writer_is_not_copied(
     """Some writers index every channel in every chunk, even channels without messages there."""
     end = ChunkBuilder.end
 
-    def listing_all(chunk: ChunkBuilder) -> bytes:
+    def end_with_empty_indexes(chunk: ChunkBuilder) -> bytes:
         for number in (1, 2):
             chunk.message_indices.setdefault(number, MessageIndex(number, []))
         return end(chunk)
 
-    monkeypatch.setattr(ChunkBuilder, "end", listing_all)
+    monkeypatch.setattr(ChunkBuilder, "end", end_with_empty_indexes)
 
     def fill(writer: Writer, schema: int) -> None:
         for topic in ("/cf1/height", "/cf2/height"):

@@ -89,17 +89,17 @@ def test_trim_keeps_the_calibration_valid_at_its_start(tmp_path: Path) -> None:
             sink.write(10 * k + 5, "/cf1/height", message_class("Height")(height_m=k))
         sink.write(95, "/cf2/camera/calibration", message_class("CameraCalibration")(width=8))
 
-    def calibrations(**stretch: int) -> list[tuple[str, int, int]]:
+    def trim_and_list_calibrations(**stretch: int) -> list[tuple[str, int, int]]:
         out.unlink(missing_ok=True)
         trim(every, out, **stretch)
         found = read(out, "/*/camera/calibration")
         return sorted((m.topic[:4], m.time_ns, m.message.width // 8) for m in found)
 
     seen = [("/cf1", 44, 4), ("/cf1", 50, 5), ("/cf2", 44, 1)]
-    assert calibrations(start_ns=44, end_ns=56) == seen
-    assert calibrations(start_ns=50, end_ns=56) == [("/cf1", 50, 5), ("/cf2", 50, 1)]
-    assert calibrations(start_ns=-5, end_ns=16) == [("/cf1", 10, 1), ("/cf2", 10, 1)]
-    assert calibrations(start_ns=94) == [("/cf1", 94, 9), ("/cf2", 95, 1)]
+    assert trim_and_list_calibrations(start_ns=44, end_ns=56) == seen
+    assert trim_and_list_calibrations(start_ns=50, end_ns=56) == [("/cf1", 50, 5), ("/cf2", 50, 1)]
+    assert trim_and_list_calibrations(start_ns=-5, end_ns=16) == [("/cf1", 10, 1), ("/cf2", 10, 1)]
+    assert trim_and_list_calibrations(start_ns=94) == [("/cf1", 94, 9), ("/cf2", 95, 1)]
 
 
 def test_trimming_to_nothing_is_an_error_and_leaves_no_file(tmp_path: Path, flight: Path) -> None:

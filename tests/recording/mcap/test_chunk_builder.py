@@ -140,8 +140,8 @@ def build_channel(topic: str, schema: str = "a", **more: str) -> Channel:
 
 def read_definitions(defined: ChannelRegistry, one: Channel) -> list[McapChannel | Schema]:
     """Return the definitions that the writer puts before the first message of a channel."""
-    begun = defined.definition_records(defined.get_channel_id(one))
-    return list(parse_records(np.frombuffer(begun, np.uint8)).iter_definitions())
+    records = defined.definition_records(defined.get_channel_id(one))
+    return list(parse_records(np.frombuffer(records, np.uint8)).iter_definitions())
 
 
 def list_summary_ids(defined: ChannelRegistry) -> tuple[list[int], list[int]]:
@@ -178,7 +178,7 @@ def test_chunk_is_copied_if_definitions_match() -> None:
     records = {n: McapChannel(n, c.topic, "protobuf", {}, 9) for n, c in mine.items()}
     schema = Schema(9, b"a", "protobuf", "a")
 
-    def chunk(*parts: McapChannel | Schema | int) -> ParsedChunk:
+    def build_parsed(*parts: McapChannel | Schema | int) -> ParsedChunk:
         held = ChunkBuilder()
         for part in parts:
             if isinstance(part, int):
@@ -187,19 +187,19 @@ def test_chunk_is_copied_if_definitions_match() -> None:
                 held.add_definition(serialize(part))
         return parse_records(np.frombuffer(bytes(held.data), np.uint8))
 
-    def stands_in(defined: ChannelRegistry, one: ParsedChunk) -> bool:
+    def can_copy(defined: ChannelRegistry, one: ParsedChunk) -> bool:
         return defined.can_copy_chunk(one.batch, one, mine)
 
-    def begun(*parts: McapChannel | Schema | int) -> tuple[ChannelRegistry, bool]:
+    def adopt_and_copy(*parts: McapChannel | Schema | int) -> tuple[ChannelRegistry, bool]:
         defined = ChannelRegistry()
         defined.adopt_channels(mine, records)
-        return defined, stands_in(defined, chunk(*parts))
+        return defined, can_copy(defined, build_parsed(*parts))
 
-    defined, stands = begun(schema, records[4], 4, records[6], 6, 4)
-    assert stands and defined.written == {4, 6}
+    defined, copied = adopt_and_copy(schema, records[4], 4, records[6], 6, 4)
+    assert copied and defined.written == {4, 6}
     assert list_summary_ids(defined) == ([9], [4, 6])
     assert defined.definition_records(4) == defined.definition_records(6) == b""
-    assert stands_in(defined, chunk(6, 4))  # both were defined by an earlier chunk
+    assert can_copy(defined, build_parsed(6, 4))  # both were defined by an earlier chunk
     for parts in (
         (records[4], 4),  # without its schema
         (schema, 4),  # not defined
@@ -208,11 +208,11 @@ def test_chunk_is_copied_if_definitions_match() -> None:
         (Schema(9, b"b", "protobuf", "a"), records[4], 4),
         (schema, records[4], McapChannel(7, "/c", "protobuf", {}, 9), 4),
     ):
-        defined, stands = begun(*parts)
-        assert not stands and not defined.written
+        defined, copied = adopt_and_copy(*parts)
+        assert not copied and not defined.written
     defined = ChannelRegistry()
     defined.get_channel_id(mine[6])
-    assert not stands_in(defined, chunk(schema, records[6], 6))  # has another ID here
+    assert not can_copy(defined, build_parsed(schema, records[6], 6))  # has another ID here
 
 
 def test_copied_channels_keep_their_ids_if_free() -> None:
@@ -224,11 +224,11 @@ def test_copied_channels_keep_their_ids_if_free() -> None:
         build_channel("/f", "d"),
     )
 
-    def theirs(number: int, one: Channel, schema_id: int) -> dict[int, McapChannel]:
+    def build_record(number: int, one: Channel, schema_id: int) -> dict[int, McapChannel]:
         return {number: McapChannel(number, one.topic, "protobuf", {}, schema_id)}
 
     for number, one, schema_id in ((9, kept, 40), (1, taken, 50), (12, other, 40)):
-        defined.adopt_channels({number: one}, theirs(number, one, schema_id))
+        defined.adopt_channels({number: one}, build_record(number, one, schema_id))
     assert [defined.get_channel_id(one) for one in (kept, other, taken)] == [9, 12, 13]
     ids = []
     for one, name in ((kept, "b"), (other, "d"), (taken, "c")):

@@ -56,24 +56,26 @@ def test_cache_is_keyed_by_file_identity_and_bounded(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(file_cache, "CACHE_ENTRIES_MAX", 2)
     now, made = time.time_ns(), list[str]()
 
-    def asked(name: str, age_s: float = 60.0, ranged: object = None, size: int = 7) -> str:
+    def get_cached_name(
+        name: str, age_s: float = 60.0, ranged: object = None, size: int = 7
+    ) -> str:
         status = SimpleNamespace(st_ino=1, st_size=size, st_mtime_ns=now - round(age_s * 1e9))
         stream: Any = SimpleNamespace(path=Path(name), status=status, remote_stream=ranged)
         found = file_cache.get_cached("x", stream, lambda: made.append(name) or name)
         return str(found)
 
     for name in ("a", "a", "b", "a"):
-        assert asked(name) == name
+        assert get_cached_name(name) == name
     assert made == ["a", "b"]
-    asked("c")  # evicts the oldest entry, a
-    asked("b")
-    asked("a")
+    get_cached_name("c")  # evicts the oldest entry, a
+    get_cached_name("b")
+    get_cached_name("a")
     assert made == ["a", "b", "c", "a"]
-    asked("a", size=8)
-    asked("a", age_s=61.0)
+    get_cached_name("a", size=8)
+    get_cached_name("a", age_s=61.0)
     assert made[4:] == ["a", "a"]
     made.clear()
     for age_s, ranged, times in ((0.0, None, 2), (0.0, "bucket", 1), (30.0, None, 1)):
         for _ in range(2):
-            asked(f"new {age_s} {ranged}", age_s, ranged)
+            get_cached_name(f"new {age_s} {ranged}", age_s, ranged)
         assert made.count(f"new {age_s} {ranged}") == times
