@@ -13,7 +13,7 @@ import pytest
 
 from dmrl.datasets import open_dataset
 
-from .inputs import Inputs, cli, flights
+from .inputs import Inputs, cli, copy_flights
 from .power_loss import Recorded
 from .workloads import read_contents
 
@@ -78,7 +78,7 @@ def test_output_is_complete_or_absent_after_power_loss(
     disk = tmp_path / "disk"
     disk.mkdir()
     if work == "index":
-        flights(inputs, disk / "a")
+        copy_flights(inputs, disk / "a")
     recorded = record_command(words, inputs, disk, tmp_path / "log")
     whole = read_output(disk / name)
     assert whole

@@ -12,7 +12,7 @@ import pytest
 from dmrl.atomic_output import to_partial_path
 from dmrl.datasets import open_dataset
 
-from .inputs import Inputs, cli, flights
+from .inputs import Inputs, cli, copy_flights
 
 RECORD_S = 2.5
 IGNORED = {"tensorboard", "pipeline.json", "unfinished", "catalogue.parquet"}
@@ -176,7 +176,7 @@ WORKLOADS = (
     Workload("predict", lambda i, out: cli("predict", i.model, i.dots, out), "a.mcap"),
     Workload("evaluate", lambda i, out: cli("evaluate", i.found, "--plots", out), "plots"),
     Workload("score", lambda i, out: cli("score", out, "--name", "mine"), "score.json"),
-    Workload("index", lambda i, out: cli("index", out), "set", before=flights, pieces=True),
+    Workload("index", lambda i, out: cli("index", out), "set", before=copy_flights, pieces=True),
     Workload("report", lambda i, out: cli("report", i.flights, out), "a.html"),
     Workload("train", _train, "model", keeps=True),
     Workload("quantize", lambda i, out: cli("quantize", i.model, i.set, out), "int8"),
