@@ -1,4 +1,4 @@
-"""Small sources of every binary format, for tests of their readers."""
+"""Small synthetic sources of every binary format."""
 
 import struct
 from collections.abc import Callable, Sequence
@@ -34,8 +34,8 @@ EVENTS: dict[int, tuple[str, plain_usd.Variables]] = {
 }
 
 
-def usd_log(version: int = 2, records: int = 100) -> bytes:
-    """Two seconds of hovering at 1 m, with motion capture and ranges."""
+def pack_usd_log(version: int = 2, records: int = 100) -> bytes:
+    """Return a micro-SD log of a flight at 1 m height, with motion capture and ranges at 50 Hz."""
     unit = {1: 1, 2: 1000}[version]
     rows: list[plain_usd.Record] = []
     for k in range(records):
@@ -48,8 +48,8 @@ def usd_log(version: int = 2, records: int = 100) -> bytes:
     return plain_usd.encode(EVENTS, rows, version)
 
 
-def flash_dump(raw: Sequence[np.ndarray], values: Sequence[Sequence[float]]) -> bytes:
-    """A HyperFlash dump of raw pictures and their six numbers, with an end marker."""
+def pack_flash_dump(raw: Sequence[np.ndarray], values: Sequence[Sequence[float]]) -> bytes:
+    """Return a HyperFlash dump of raw images, each with six numbers, and an end marker."""
     records = [
         pixels.astype(np.uint8).tobytes() + struct.pack("<6f", *numbers)
         for pixels, numbers in zip(raw, values, strict=True)
@@ -57,25 +57,26 @@ def flash_dump(raw: Sequence[np.ndarray], values: Sequence[Sequence[float]]) -> 
     return b"".join(records) + b"\xff" * 71704
 
 
-def pictures(count: int, height: int = 24, width: int = 32) -> list[np.ndarray]:
-    """Raw pictures of a seed of their own."""
+def make_raw_images(count: int, height: int = 24, width: int = 32) -> list[np.ndarray]:
+    """Return (height, width) uint8 images of random pixels; the same at every call."""
     rng = np.random.default_rng(5)
     return [rng.integers(0, 256, (height, width), np.uint8) for _ in range(count)]
 
 
-def stream() -> bytes:
-    """A CPX stream of nanocockpit's and of Bitcraze's kind, one behind the other."""
+def pack_cpx_stream() -> bytes:
+    """Return three images in the CPX layout of nanocockpit, then one in that of Bitcraze."""
     state = RobotState(1000, 990_000, (1.0, 2.0, 0.5), (0.1, 0.0, 0.0))
     made = b"".join(
         pack_image(
             Image(32, 24, "raw", raw.tobytes(), 1_000_000 + 50_000 * k, k, state), "streamer"
         )
-        for k, raw in enumerate(pictures(3))
+        for k, raw in enumerate(make_raw_images(3))
     )
-    return made + pack_image(Image(32, 24, "raw", pictures(1)[0].tobytes()))
+    return made + pack_image(Image(32, 24, "raw", make_raw_images(1)[0].tobytes()))
 
 
-def _messages(store: Any, ranges_stamped: bool) -> list[tuple[str, str, int, Any]]:
+def _make_messages(store: Any, ranges_stamped: bool) -> list[tuple[str, str, int, Any]]:
+    """Return topic, type, time in nanoseconds and content of 25 messages at 10 Hz."""
     types = store.types
 
     def header(time_ns: int, fields: dict[str, Any]) -> Any:
@@ -111,7 +112,7 @@ def _messages(store: Any, ranges_stamped: bool) -> list[tuple[str, str, int, Any
             range=1.5 + k,
         )  # fmt: skip
         found.append(("/uwb/cf1/cf2/distance", "sensor_msgs/msg/Range", time_ns, ranged))
-        raw = pictures(1)[0]
+        raw = make_raw_images(1)[0]
         image = types["sensor_msgs/msg/Image"](
             header=head, height=24, width=32, encoding="bayer_rggb8", is_bigendian=0, step=32,
             data=raw.ravel(),
@@ -122,12 +123,13 @@ def _messages(store: Any, ranges_stamped: bool) -> list[tuple[str, str, int, Any
     return found
 
 
-def ros2_bag(
+def write_ros2_bag(
     folder: Path, storage: str = "sqlite3", *, late_ns: int = 0, ranges_stamped: bool = True
 ) -> Path:
-    """A rosbag2 folder: odometry, motion capture, ranges, raw pictures, and a text.
+    """Write a rosbag2 folder with odometry, motion capture, ranges, raw images and text.
 
-    All came ``late_ns`` after their stamps; ranges may have stamps of 0.
+    Messages are received ``late_ns`` after their stamps. Without ``ranges_stamped`` the stamps of
+    the ranges are 0.
     """
     store = get_typestore(Stores.ROS2_HUMBLE)
     with Writer2(folder, version=9, storage_plugin=StoragePlugin[storage.upper()]) as writer:
@@ -135,8 +137,8 @@ def ros2_bag(
     return folder
 
 
-def ros1_bag(path: Path) -> Path:
-    """The same as a ROS 1 bag."""
+def write_ros1_bag(path: Path) -> Path:
+    """Write the messages of `write_ros2_bag` to a ROS 1 bag."""
     store = get_typestore(Stores.ROS1_NOETIC)
     with Writer1(path) as writer:
         _write(writer, store, store.serialize_ros1)
@@ -150,15 +152,19 @@ def _write(
     late_ns: int = 0,
     ranges_stamped: bool = True,
 ) -> None:
+    """Write the messages to an open bag."""
     connections: dict[str, Any] = {}
-    for topic, kind, time_ns, message in _messages(store, ranges_stamped):
+    for topic, kind, time_ns, message in _make_messages(store, ranges_stamped):
         if topic not in connections:
             connections[topic] = writer.add_connection(topic, kind, typestore=store)
         writer.write(connections[topic], time_ns + late_ns, serialize(message, kind))
 
 
-def nanocockpit(folder: Path, count: int = 6) -> Path:
-    """A folder of the nanocockpit client whose counters wrap half way."""
+def write_nanocockpit(folder: Path, count: int = 6) -> Path:
+    """Write a folder of the nanocockpit client.
+
+    Image number and time wrap between the third and the fourth image.
+    """
     (folder / "camera_raw").mkdir(parents=True)
     state = "state_x,state_y,state_z,state_vx,state_vy,state_vz,state_ax,state_ay,state_az"
     lines = [
@@ -166,7 +172,7 @@ def nanocockpit(folder: Path, count: int = 6) -> Path:
         f"state_stm32_timestamp,tof_timestamp,{state},state_quat,state_rateRoll,state_ratePitch,"
         "state_rateYaw"
     ]
-    for k, raw in enumerate(pictures(count)):
+    for k, raw in enumerate(make_raw_images(count)):
         (folder / "camera_raw" / f"{k:05d}.png").write_bytes(encode_png(raw))
         time = (2**32 - 120_000 + 50_000 * k) % 2**32
         told = (time - 5_000) % 2**32
@@ -177,8 +183,8 @@ def nanocockpit(folder: Path, count: int = 6) -> Path:
     return folder
 
 
-def coloured(height: int = 24, width: int = 32) -> dict[str, bytes]:
-    """One picture in the formats that a folder of pictures may hold."""
-    rgb = np.repeat(pictures(1, height, width)[0][..., None], 3, axis=2)
+def encode_grey_image(height: int = 24, width: int = 32) -> dict[str, bytes]:
+    """Return one image as PNG, JPEG and PPM, by file name."""
+    rgb = np.repeat(make_raw_images(1, height, width)[0][..., None], 3, axis=2)
     head = f"P6\n# hi\n{width} {height}\n255\n".encode()
     return {"a.png": encode_png(rgb), "b.jpg": encode_jpeg(rgb), "c.ppm": head + rgb.tobytes()}

@@ -1,4 +1,4 @@
-"""Micro-SD logs written and read value by value, as reference of the fast decoder."""
+"""Micro-SD logs written and read value by value, as a reference for the fast decoder."""
 
 import struct
 import zlib
@@ -11,7 +11,7 @@ Record = tuple[int, int, tuple[float, ...]]
 def encode(
     events: dict[int, tuple[str, Variables]], records: Sequence[Record], version: int = 2
 ) -> bytes:
-    """A log: events by id, records of (id, ticks, values)."""
+    """Return a log with these events, by id, and records of id, time in ticks, and values."""
     out = bytearray(struct.pack("<BHH", 0xBC, version, len(events)))
     for number, (name, variables) in events.items():
         out += struct.pack("<H", number) + name.encode() + b"\0"
@@ -26,7 +26,7 @@ def encode(
 
 
 def decode(data: bytes) -> dict[str, dict[str, list[float]]]:
-    """Values of each variable of each event, in lists; times as counted, in "timestamp"."""
+    """Return the values of each variable of each event; times in ticks are in "timestamp"."""
     _, version, count = struct.unpack_from("<BHH", data)
     at, kinds, found = 5, {}, {}
     for _ in range(count):

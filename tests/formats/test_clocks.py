@@ -24,13 +24,13 @@ WRAPS = {
 }
 
 
-def row(k: int) -> str:
-    """Line of a row, below a header."""
+def name_row(k: int) -> str:
+    """Return file and line of row k, below a header."""
     return f"a.csv:{k + 2}"
 
 
-def steady(duration_s: float, rate_hz: float, start_s: float = 0.0) -> np.ndarray:
-    """Even times, whole milliseconds."""
+def make_times(duration_s: float, rate_hz: float, start_s: float = 0.0) -> np.ndarray:
+    """Return evenly spaced times in nanoseconds, rounded to milliseconds."""
     return np.rint((start_s + np.arange(0, duration_s, 1 / rate_hz)) * 1e3).astype(np.int64) * 10**6
 
 
@@ -48,10 +48,10 @@ def test_a_counter_that_wraps_goes_on(
     tick_ns, bits = WRAPS[counter]
     period_ns = tick_ns << bits
     rng = np.random.default_rng(seed)
-    true = steady(before_s + after_s, rate_hz, 1000) + rng.integers(0, 10**6, 1)
+    true = make_times(before_s + after_s, rate_hz, 1000) + rng.integers(0, 10**6, 1)
     true = true - true[0] + period_ns - int(before_s * S)
     true = true // tick_ns * tick_ns
-    found = settle_times(true % period_ns, row)
+    found = settle_times(true % period_ns, name_row)
     np.testing.assert_array_equal(found.time_ns - found.time_ns[0], true - true[0])
     assert found.rows.tolist() == list(range(len(true)))
 
@@ -62,16 +62,16 @@ def test_a_counter_that_wraps_goes_on(
 )
 def test_a_short_counter_that_wraps_at_every_few_rows_goes_on(period_ns: int, rate_hz: int) -> None:
     true = np.rint(np.arange(200) / rate_hz * 1e3).astype(np.int64) * 10**6
-    found = settle_times(true % period_ns, row)
+    found = settle_times(true % period_ns, name_row)
     np.testing.assert_array_equal(found.time_ns, true)
     assert found.rows.tolist() == list(range(200))
 
 
 def test_rows_of_a_short_file_that_are_out_of_order_are_sorted() -> None:
-    true = steady(0.5, 100)
+    true = make_times(0.5, 100)
     told = true.copy()
     told[[10, 11, 20, 21]] = told[[11, 10, 21, 20]]
-    np.testing.assert_array_equal(settle_times(told, row).time_ns, true)
+    np.testing.assert_array_equal(settle_times(told, name_row).time_ns, true)
 
 
 @example(first_s=2.0, second_s=2.0, start_s=1.0, rate_hz=5)
@@ -86,12 +86,12 @@ def test_rows_of_a_short_file_that_are_out_of_order_are_sorted() -> None:
 def test_a_clock_that_starts_again_is_refused_with_its_line(
     first_s: float, second_s: float, start_s: float, rate_hz: int
 ) -> None:
-    first, second = steady(first_s, rate_hz, start_s), steady(second_s, rate_hz)
+    first, second = make_times(first_s, rate_hz, start_s), make_times(second_s, rate_hz)
     periods_s = [tick_ns * 2**bits / S for tick_ns, bits in WRAPS.values()]
     assume(first[-1] >= 2 * S)
     assume(not any(0 <= p - first[-1] / S <= 2.1 / rate_hz for p in periods_s))  # looks like a wrap
     with pytest.raises(SourceError, match=rf"a\.csv:{len(first) + 2}: time goes back from"):
-        settle_times(np.concatenate([first, second]), row)
+        settle_times(np.concatenate([first, second]), name_row)
 
 
 @given(
@@ -100,26 +100,26 @@ def test_a_clock_that_starts_again_is_refused_with_its_line(
     where=st.sampled_from(["before", "within"]),
 )
 def test_times_of_an_unset_clock_are_left_out(zeros: int, start_s: float, where: str) -> None:
-    true = steady(10, 50, start_s)
+    true = make_times(10, 50, start_s)
     at = 0 if where == "before" else 100
     told = np.insert(true, at, np.zeros(zeros, np.int64))
     with count_left_out() as left_out:
-        found = settle_times(told, row)
+        found = settle_times(told, name_row)
     np.testing.assert_array_equal(found.time_ns, true)
     np.testing.assert_array_equal(told[found.rows], true)
     assert sum(left_out.counts.values()) == zeros
-    assert set(left_out.first.values()) == {row(at)}
+    assert set(left_out.first.values()) == {name_row(at)}
 
 
-def test_a_time_of_0_among_times_near_0_is_a_time() -> None:
-    true = steady(2, 20)
-    np.testing.assert_array_equal(settle_times(true, row).time_ns, true)
+def test_time_0_is_valid_on_a_clock_that_starts_near_0() -> None:
+    true = make_times(2, 20)
+    np.testing.assert_array_equal(settle_times(true, name_row).time_ns, true)
 
 
 def test_rows_before_the_clock_was_set_are_left_out() -> None:
-    booted, true = steady(1, 50, 3), steady(10, 50, 1.7e9)
+    booted, true = make_times(1, 50, 3), make_times(10, 50, 1.7e9)
     with count_left_out() as left_out:
-        found = settle_times(np.concatenate([booted, true]), row)
+        found = settle_times(np.concatenate([booted, true]), name_row)
     np.testing.assert_array_equal(found.time_ns, true)
     assert left_out.counts == {"rows with times from before the clock was set": 50}
 
@@ -127,25 +127,25 @@ def test_rows_before_the_clock_was_set_are_left_out() -> None:
 @pytest.mark.parametrize("jump_s", [-30.0, 5.0, 1e6])
 @pytest.mark.parametrize("rows", [1, 2, 3])
 def test_times_that_jump_and_return_are_left_out(jump_s: float, rows: int) -> None:
-    told = steady(60, 50, 40)
+    told = make_times(60, 50, 40)
     told[1000 : 1000 + rows] += int(jump_s * S)
     with count_left_out() as left_out:
-        found = settle_times(told, row)
+        found = settle_times(told, name_row)
     assert left_out.counts == {"rows whose time jumps and returns": rows}
-    assert left_out.first["rows whose time jumps and returns"] == row(1000)
+    assert left_out.first["rows whose time jumps and returns"] == name_row(1000)
     assert found.rows.tolist() == [k for k in range(3000) if not 1000 <= k < 1000 + rows]
 
 
 def test_a_gap_is_no_jump() -> None:
-    told = np.concatenate([steady(5, 50), steady(0.02, 50, 20), steady(5, 50, 40)])
-    np.testing.assert_array_equal(settle_times(told, row).time_ns, told)
+    told = np.concatenate([make_times(5, 50), make_times(0.02, 50, 20), make_times(5, 50, 40)])
+    np.testing.assert_array_equal(settle_times(told, name_row).time_ns, told)
 
 
 @pytest.mark.parametrize("order", ["swapped", "shuffled", "reversed"])
 def test_rows_that_are_out_of_order_are_sorted(
     order: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    true = steady(30, 20)
+    true = make_times(30, 20)
     told = true.copy()
     if order == "swapped":
         told[[10, 11]] = told[[11, 10]]
@@ -153,7 +153,7 @@ def test_rows_that_are_out_of_order_are_sorted(
         told = np.random.default_rng(0).permutation(told)
     else:
         told = told[::-1]
-    found = settle_times(told, row)
+    found = settle_times(told, name_row)
     np.testing.assert_array_equal(found.time_ns, true)
     np.testing.assert_array_equal(told[found.rows], true)
     assert "not in time order from here on; sorted" in capsys.readouterr().err
@@ -161,9 +161,9 @@ def test_rows_that_are_out_of_order_are_sorted(
 
 def test_equal_times_are_refused() -> None:
     with pytest.raises(SourceError, match=r"a\.csv:2: all 200 times are 1\.7e\+09 s"):
-        settle_times(np.full(200, 1_700_000_000 * S), row)
-    assert len(settle_times([5, 5], row).rows) == 2
-    assert len(settle_times([], row).rows) == 0
+        settle_times(np.full(200, 1_700_000_000 * S), name_row)
+    assert len(settle_times([5, 5], name_row).rows) == 2
+    assert len(settle_times([], name_row).rows) == 0
 
 
 @given(
@@ -198,60 +198,60 @@ def test_missing_values_between_equal_ones_make_them_new() -> None:
 WALL = 1_700_000_000 * S
 
 
-def times_of(messages: list[tuple[str, int | None, int]]) -> list[int | None]:
-    """Times of messages of a bag."""
+def find_times(messages: list[tuple[str, int | None, int]]) -> list[int | None]:
+    """Return the times of messages, given as topic, stamp and time of receipt, nanoseconds."""
     clock = MessageClock.from_stamps("a bag", iter(messages))
     return [clock.find_time_ns(*message) for message in messages]
 
 
 def test_simulated_time_from_zero() -> None:
     told = [("odom", k * S // 10, WALL + k * S // 5) for k in range(20)]
-    assert times_of(told) == [k * S // 10 for k in range(20)]
+    assert find_times(told) == [k * S // 10 for k in range(20)]
     told.insert(1, ("no_header", None, WALL))
-    assert times_of(told)[1] == 0
+    assert find_times(told)[1] == 0
 
 
 def test_stamps_of_zero_of_a_real_robot_are_replaced() -> None:
     stamped = [("odom", WALL - S + k, WALL + k) for k in range(5)]
     unset = [("range", 0, WALL + k) for k in range(5)]
-    assert times_of([*unset, *stamped]) == [WALL + k for k in range(5)] + [s[1] for s in stamped]
+    assert find_times([*unset, *stamped]) == [WALL + k for k in range(5)] + [s[1] for s in stamped]
     late = [("odom", 1000 * S + k, 1001 * S + k) for k in range(3)]
-    assert times_of([*late, ("range", 0, 1002 * S)])[-1] == 1002 * S
+    assert find_times([*late, ("range", 0, 1002 * S)])[-1] == 1002 * S
 
 
 def stamp_again(k: int) -> int:
-    """Stamps of a simulation that is reset after 10 s."""
+    """Return stamp k of a simulation that is reset after 10 s."""
     return k * S // 10 if k < 100 else (k - 100) * S // 10
 
 
 def stamp_wrong_back(k: int) -> int:
-    """Stamps of which one is too small."""
+    """Return stamp k of a series in which one is too small."""
     return S if k == 50 else WALL + k * S // 10
 
 
 def stamp_wrong_ahead(k: int) -> int:
-    """Stamps of which one is too large."""
+    """Return stamp k of a series in which one is too large."""
     return 2 * WALL if k == 50 else WALL + k * S // 10
 
 
 def test_a_simulation_that_was_reset_is_refused() -> None:
     with pytest.raises(SourceError, match=r"a bag: the stamps of odom go back from 9\.9 s"):
-        times_of([("odom", stamp_again(k), WALL + k * S // 10) for k in range(200)])
+        find_times([("odom", stamp_again(k), WALL + k * S // 10) for k in range(200)])
 
 
 @pytest.mark.parametrize(("stamp", "kept"), [(stamp_wrong_back, 119), (stamp_wrong_ahead, 120)])
 def test_one_wrong_stamp_refuses_no_bag(stamp: Callable[[int], int], kept: int) -> None:
-    times = times_of([("odom", stamp(k), WALL + k * S // 10) for k in range(120)])
+    times = find_times([("odom", stamp(k), WALL + k * S // 10) for k in range(120)])
     assert sum(time is not None for time in times) == kept
     assert times[-1] == WALL + 119 * S // 10
 
 
-def test_values_that_change_every_few_rows_are_held_though_their_steps_are_equal() -> None:
+def test_held_values_with_equal_steps_are_recognized() -> None:
     approaching = np.repeat(np.arange(5.0, 2.0, -0.1), 10)
     assert np.flatnonzero(find_new_values(approaching)).tolist() == list(range(0, 300, 10))
 
 
-def test_values_that_are_held_between_gaps_are_not_new() -> None:
+def test_held_values_between_gaps_are_not_new() -> None:
     measured = 2 + np.random.default_rng(0).random(20)
     values = np.repeat(measured, 10)
     values[np.arange(200) % 10 >= 3] = np.nan

@@ -1,4 +1,4 @@
-"""Poses of a Crazyflie log: the orientation that belongs to a position."""
+"""Poses of a Crazyflie log combine a position with the orientation of its time."""
 
 import numpy as np
 import pytest

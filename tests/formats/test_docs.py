@@ -1,3 +1,5 @@
+"""docs/sources.md describes every format, and its example works."""
+
 from dataclasses import fields
 from pathlib import Path
 from typing import Any

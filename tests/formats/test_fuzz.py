@@ -1,4 +1,7 @@
-"""Damaged sources of every binary format: one line or partial data, and nothing worse."""
+"""Damaged sources of every binary format give a one-line error or the undamaged part.
+
+They never give another error, a hang, or more than 500 MB of memory.
+"""
 
 import os
 import resource
@@ -32,56 +35,67 @@ run(sys.argv[2], int(sys.argv[3]), Path(sys.argv[4]))
 """
 
 
-def _usd(version: int) -> Callable[[Path], tuple[Path, Path]]:
+def _make_usd_writer(version: int) -> Callable[[Path], tuple[Path, Path]]:
+    """Return a function that writes a micro-SD log, and returns source and file."""
+
     def make(folder: Path) -> tuple[Path, Path]:
         path = folder / "log"
-        path.write_bytes(foreign.usd_log(version))
+        path.write_bytes(foreign.pack_usd_log(version))
         return path, path
 
     return make
 
 
-def _flash(folder: Path) -> tuple[Path, Path]:
+def _write_flash(folder: Path) -> tuple[Path, Path]:
+    """Write a HyperFlash dump; return source and file."""
     path = folder / "flash.bin"
-    raw = foreign.pictures(2, 224, 320)
-    path.write_bytes(foreign.flash_dump(raw, [[1, 2, 1, 0, 0, 1]] * 2))
+    raw = foreign.make_raw_images(2, 224, 320)
+    path.write_bytes(foreign.pack_flash_dump(raw, [[1, 2, 1, 0, 0, 1]] * 2))
     return path, path
 
 
-def _stream(folder: Path) -> tuple[Path, Path]:
+def _write_stream(folder: Path) -> tuple[Path, Path]:
+    """Write a CPX stream; return source and file."""
     path = folder / "flight.cpx"
-    path.write_bytes(foreign.stream())
+    path.write_bytes(foreign.pack_cpx_stream())
     return path, path
 
 
-def _bag(storage: str) -> Callable[[Path], tuple[Path, Path]]:
+def _make_ros2_writer(storage: str) -> Callable[[Path], tuple[Path, Path]]:
+    """Return a function that writes a rosbag2 folder, and returns source and file."""
+
     def make(folder: Path) -> tuple[Path, Path]:
-        bag = foreign.ros2_bag(folder / "bag", storage)
+        bag = foreign.write_ros2_bag(folder / "bag", storage)
         return bag, next(path for path in bag.iterdir() if path.suffix in (".db3", ".mcap"))
 
     return make
 
 
-def _bag1(folder: Path) -> tuple[Path, Path]:
-    path = foreign.ros1_bag(folder / "flight.bag")
+def _write_ros1_bag(folder: Path) -> tuple[Path, Path]:
+    """Write a ROS 1 bag; return source and file."""
+    path = foreign.write_ros1_bag(folder / "flight.bag")
     return path, path
 
 
-def _picture(name: str) -> Callable[[Path], tuple[Path, Path]]:
+def _make_picture_writer(name: str) -> Callable[[Path], tuple[Path, Path]]:
+    """Return a function that writes a folder of one image, and returns source and file."""
+
     def make(folder: Path) -> tuple[Path, Path]:
         path = folder / name
-        path.write_bytes(foreign.coloured()[name])
+        path.write_bytes(foreign.encode_grey_image()[name])
         return folder, path
 
     return make
 
 
-def _nanocockpit(folder: Path) -> tuple[Path, Path]:
-    source = foreign.nanocockpit(folder / "cockpit")
+def _write_nanocockpit(folder: Path) -> tuple[Path, Path]:
+    """Write a nanocockpit folder; return it and one of its images."""
+    source = foreign.write_nanocockpit(folder / "cockpit")
     return source, source / "camera_raw" / "00002.png"
 
 
-def _ranges(folder: Path) -> tuple[Path, Path]:
+def _write_ranges(folder: Path) -> tuple[Path, Path]:
+    """Write ranges of TIERS; return source and file."""
     path = folder / "ranges.npz"
     time = np.arange(20)
     pose = {f"optitrack_turtle0{n}_pose_np": np.stack([time * 0.01, time * n], 1) for n in (1, 2)}
@@ -90,7 +104,9 @@ def _ranges(folder: Path) -> tuple[Path, Path]:
     return path, path
 
 
-def _saved(suffix: str) -> Callable[[Path], tuple[Path, Path]]:
+def _make_saved_picture_writer(suffix: str) -> Callable[[Path], tuple[Path, Path]]:
+    """Return a function that saves an image by Pillow, and returns its folder and file."""
+
     def make(folder: Path) -> tuple[Path, Path]:
         path = folder / f"a.{suffix}"
         rgb = np.random.default_rng(0).integers(0, 256, (12, 16, 3), np.uint8)
@@ -100,9 +116,11 @@ def _saved(suffix: str) -> Callable[[Path], tuple[Path, Path]]:
     return make
 
 
-def _labelled(name: str, text: str) -> Callable[[Path], tuple[Path, Path]]:
+def _make_label_writer(name: str, text: str) -> Callable[[Path], tuple[Path, Path]]:
+    """Return a function that writes an image with a file of labels, and returns source and file."""
+
     def make(folder: Path) -> tuple[Path, Path]:
-        (folder / "a.png").write_bytes(foreign.coloured()["a.png"])
+        (folder / "a.png").write_bytes(foreign.encode_grey_image()["a.png"])
         (folder / "classes.txt").write_text("drone\n")
         (folder / name).write_text(text)
         return folder, folder / name
@@ -120,32 +138,33 @@ VOC = """<annotation><size><width>5</width><height>4</height></size><object><nam
 <bndbox><xmin>1</xmin><ymin>2</ymin><xmax>3</xmax><ymax>4</ymax></bndbox></object></annotation>
 """
 
-# Format, and a maker of a source with the one file of it that is damaged.
+# Format of each source, and a function that writes it. The function returns the source and the
+# file of it that is damaged.
 SOURCES = {
-    "cfusdlog 1": ("cfusdlog", _usd(1)),
-    "cfusdlog 2": ("cfusdlog", _usd(2)),
-    "hyperflash": ("hyperflash", _flash),
-    "aideck-stream": ("aideck-stream", _stream),
-    "rosbag2 db3": ("rosbag2", _bag("sqlite3")),
-    "rosbag2 mcap": ("rosbag2", _bag("mcap")),
-    "ROS 1 bag": ("rosbag2", _bag1),
-    "PNG": ("images", _picture("a.png")),
-    "JPEG": ("images", _picture("b.jpg")),
-    "PPM": ("images", _picture("c.ppm")),
-    "TIFF": ("images", _saved("tif")),
-    "WebP": ("images", _saved("webp")),
-    "GIF": ("images", _saved("gif")),
-    "YOLO": ("yolo", _labelled("a.txt", BOXES)),
-    "YOLO's description": ("yolo", _labelled("data.yaml", DESCRIPTION)),
-    "COCO": ("coco", _labelled("set.json", COCO)),
-    "VOC": ("voc", _labelled("a.xml", VOC)),
-    "nanocockpit": ("nanocockpit", _nanocockpit),
-    "npz": ("uwb-tiers", _ranges),
+    "cfusdlog 1": ("cfusdlog", _make_usd_writer(1)),
+    "cfusdlog 2": ("cfusdlog", _make_usd_writer(2)),
+    "hyperflash": ("hyperflash", _write_flash),
+    "aideck-stream": ("aideck-stream", _write_stream),
+    "rosbag2 db3": ("rosbag2", _make_ros2_writer("sqlite3")),
+    "rosbag2 mcap": ("rosbag2", _make_ros2_writer("mcap")),
+    "ROS 1 bag": ("rosbag2", _write_ros1_bag),
+    "PNG": ("images", _make_picture_writer("a.png")),
+    "JPEG": ("images", _make_picture_writer("b.jpg")),
+    "PPM": ("images", _make_picture_writer("c.ppm")),
+    "TIFF": ("images", _make_saved_picture_writer("tif")),
+    "WebP": ("images", _make_saved_picture_writer("webp")),
+    "GIF": ("images", _make_saved_picture_writer("gif")),
+    "YOLO": ("yolo", _make_label_writer("a.txt", BOXES)),
+    "YOLO's description": ("yolo", _make_label_writer("data.yaml", DESCRIPTION)),
+    "COCO": ("coco", _make_label_writer("set.json", COCO)),
+    "VOC": ("voc", _make_label_writer("a.xml", VOC)),
+    "nanocockpit": ("nanocockpit", _write_nanocockpit),
+    "npz": ("uwb-tiers", _write_ranges),
 }
 
 
 def convert(name: str, source: Path) -> int:
-    """Messages of a source. DmrlError is the one error that may come."""
+    """Convert a source; return its number of messages. DmrlError is the only allowed error."""
     count = 0
     for sample in load_builtin_formats()[name].content(source, Options()).samples:
         message_class(sample.message)(**sample.fields).SerializeToString()
@@ -154,7 +173,7 @@ def convert(name: str, source: Path) -> int:
 
 
 def run(which: str, count: int, folder: Path) -> None:
-    """Damage a source ``count`` times; prints how often it failed and what it took at most."""
+    """Damage a source ``count`` times; print how often it was refused, and the most memory."""
     import signal  # noqa: PLC0415
 
     name, make = SOURCES[which]
@@ -166,7 +185,7 @@ def run(which: str, count: int, folder: Path) -> None:
     failed = 0
     for k in range(count):
         path.write_bytes(mutate(whole, rng))
-        signal.alarm(HANG_S)  # ends this process
+        signal.alarm(HANG_S)  # ends this process if it hangs
         try:
             convert(name, source)
         except DmrlError as e:
@@ -181,7 +200,8 @@ def run(which: str, count: int, folder: Path) -> None:
     sys.stdout.write(f"{which}: {failed} of {count} refused, {grown / 1e6:.0f} MB\n")
 
 
-def _in_a_process(which: str, count: int, folder: Path) -> str:
+def _run_in_process(which: str, count: int, folder: Path) -> str:
+    """Call `run` in a process of its own; return what it prints."""
     tests = str(Path(__file__).parents[1])
     done = subprocess.run(
         [sys.executable, "-c", ALONE, tests, which, str(count), str(folder)],
@@ -205,7 +225,7 @@ def test_two_thousand_damages_are_survived(
     which: str, tmp_path: Path, request: pytest.FixtureRequest
 ) -> None:
     cases = round(2000 * float(os.environ.get("DMRL_FAULTS", "1")))
-    said = _in_a_process(which, cases, tmp_path)
+    said = _run_in_process(which, cases, tmp_path)
     refused = int(said.partition(f" of {cases} refused")[0].split()[-1])
     counts = {"cases": cases, "refused": refused, "right": cases - refused}
     row = [f"damaged: a source, {which}", counts]

@@ -1,4 +1,4 @@
-"""Hostile ROS bags: decompression bombs, endless views, definitions with code."""
+"""Hostile ROS bags: decompression bombs, endless SQL views, and definitions with code."""
 
 import bz2
 import os
@@ -41,15 +41,17 @@ FOLDER = """rosbag2_bagfile_information:
   compression_mode: FILE
 """
 MD5 = "5c9fb1a886e81e3162a5c87bf55c072b"
-"""Of ``int32 a``, as ROS 1 sums up a definition."""
+"""ROS 1 checksum of the message definition ``int32 a``."""
 
 
-def read(path: Path) -> None:
+def read_all(path: Path) -> None:
+    """Read every sample of a bag."""
     for _ in load_content(path, Options()).samples:
         pass
 
 
-def record(header: dict[str, bytes], data: bytes = b"") -> bytes:
+def pack_record(header: dict[str, bytes], data: bytes = b"") -> bytes:
+    """Return a record of a ROS 1 bag."""
     fields = b"".join(
         struct.pack("<I", len(key) + 1 + len(value)) + f"{key}=".encode() + value
         for key, value in header.items()
@@ -57,50 +59,62 @@ def record(header: dict[str, bytes], data: bytes = b"") -> bytes:
     return struct.pack("<I", len(fields)) + fields + struct.pack("<I", len(data)) + data
 
 
-def number(*values: int) -> bytes:
+def pack_numbers(*values: int) -> bytes:
+    """Return little-endian unsigned numbers of 32 bits."""
     return struct.pack(f"<{len(values)}I", *values)
 
 
-def ros1_bag(path: Path, chunk: bytes, size: int, kind: str, compression: str) -> Path:
-    """A bag of one chunk and one connection."""
+def write_ros1_bag(path: Path, chunk: bytes, size: int, kind: str, compression: str) -> Path:
+    """Write a ROS 1 bag of one chunk, which claims ``size`` bytes, and one connection."""
     said = {"topic": b"/cf1/odom", "type": kind.encode(), "md5sum": MD5.encode()}
     fields = {**said, "message_definition": b"int32 a\n"}
-    about = record(fields)[4:-4]
-    connection = record({"op": b"\x07", "conn": number(0), "topic": b"/cf1/odom"}, about)
-    body = record(
-        {"op": b"\x05", "compression": compression.encode(), "size": number(size)}, chunk
-    ) + record(
-        {"op": b"\x04", "ver": number(1), "conn": number(0), "count": number(1)}, number(0, 0, 0)
+    about = pack_record(fields)[4:-4]
+    connection = pack_record({"op": b"\x07", "conn": pack_numbers(0), "topic": b"/cf1/odom"}, about)
+    body = pack_record(
+        {"op": b"\x05", "compression": compression.encode(), "size": pack_numbers(size)}, chunk
+    ) + pack_record(
+        {"op": b"\x04", "ver": pack_numbers(1), "conn": pack_numbers(0), "count": pack_numbers(1)},
+        pack_numbers(0, 0, 0),
     )
     start = 13 + 4096
 
-    def head(index: int, fill: int) -> bytes:
+    def pack_head(index: int, fill: int) -> bytes:
         places = {"op": b"\x03", "index_pos": struct.pack("<Q", index)}
-        return record({**places, "conn_count": number(1), "chunk_count": number(1)}, b" " * fill)
+        return pack_record(
+            {**places, "conn_count": pack_numbers(1), "chunk_count": pack_numbers(1)}, b" " * fill
+        )
 
-    filled = head(start + len(body), 4096 - len(head(0, 0)))
-    place = {"op": b"\x06", "ver": number(1), "chunk_pos": struct.pack("<Q", start)}
-    times = {"start_time": number(0, 0), "end_time": number(1, 0), "count": number(1)}
+    filled = pack_head(start + len(body), 4096 - len(pack_head(0, 0)))
+    place = {"op": b"\x06", "ver": pack_numbers(1), "chunk_pos": struct.pack("<Q", start)}
+    times = {
+        "start_time": pack_numbers(0, 0),
+        "end_time": pack_numbers(1, 0),
+        "count": pack_numbers(1),
+    }
     path.write_bytes(
-        b"#ROSBAG V2.0\n" + filled + body + connection + record(place | times, number(0, 1))
+        b"#ROSBAG V2.0\n"
+        + filled
+        + body
+        + connection
+        + pack_record(place | times, pack_numbers(0, 1))
     )
     return path
 
 
 @pytest.fixture
 def small_limit(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A smaller bomb is too large already: one of the true size takes seconds."""
+    """Lower the memory limit, because a bomb beyond the true limit takes seconds."""
     monkeypatch.setattr(limits, "MEMORY_BYTES", 64 << 20)
 
 
 @pytest.mark.usefixtures("small_limit")
 @pytest.mark.heavy
 def test_a_chunk_of_ros_1_that_unpacks_to_much_is_refused(tmp_path: Path) -> None:
-    zeros = bz2.compress(bytes(1 << 20)) * 200  # bz2 takes one stream after the other
-    path = ros1_bag(tmp_path / "a.bag", zeros, 200 << 20, "nav_msgs/Odometry", "bz2")
+    zeros = bz2.compress(bytes(1 << 20)) * 200  # bz2 decompresses concatenated streams
+    path = write_ros1_bag(tmp_path / "a.bag", zeros, 200 << 20, "nav_msgs/Odometry", "bz2")
     assert path.stat().st_size < 100_000
     with pytest.raises(SourceError, match="decompresses to much more than its size explains"):
-        read(path)
+        read_all(path)
 
 
 @pytest.mark.usefixtures("small_limit")
@@ -109,7 +123,7 @@ def test_a_compressed_file_of_a_bag_does_not_fill_the_disk(tmp_path: Path) -> No
     (tmp_path / "a.db3.zstd").write_bytes(frame * 10)
     (tmp_path / "metadata.yaml").write_text(FOLDER)
     with pytest.raises(SourceError, match="decompresses to much more than its size explains"):
-        read(tmp_path)
+        read_all(tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -127,7 +141,7 @@ def test_a_database_that_computes_is_refused(tmp_path: Path, text: str) -> None:
     with sqlite3.connect(path) as database:
         database.executescript(text)
     with pytest.raises(SourceError, match="has more than tables"):
-        read(path)
+        read_all(path)
 
 
 @pytest.mark.parametrize(
@@ -139,19 +153,19 @@ def test_a_database_that_computes_is_refused(tmp_path: Path, text: str) -> None:
     ],
 )
 def test_the_name_of_a_type_is_not_run(tmp_path: Path, kind: str) -> None:
-    """rosbags makes Python of definitions, whose names its grammar must have let through."""
+    """rosbags generates Python code from definitions, so the names in them must be checked."""
     mark = tmp_path / "run"
-    path = ros1_bag(tmp_path / "a.bag", bytes(8), 8, kind.format(mark), "none")
+    path = write_ros1_bag(tmp_path / "a.bag", bytes(8), 8, kind.format(mark), "none")
     with pytest.raises(SourceError):
-        read(path)
+        read_all(path)
     assert not mark.exists()
 
 
 @pytest.mark.parametrize("begin", [b"", b"#ROSBAG V2.0", b"#ROSBAG V1.2\n"])
-def test_a_line_without_end_is_not_read(tmp_path: Path, begin: bytes) -> None:
-    """rosbags reads the first line of a ROS 1 bag, which may be a gigabyte of zeros."""
+def test_endless_first_line_is_not_read(tmp_path: Path, begin: bytes) -> None:
+    """rosbags reads the first line of a ROS 1 bag, which may be a gigabyte without a newline."""
     path = tmp_path / "a.bag"
     path.write_bytes(begin)
     os.truncate(path, 1 << 30)
     with pytest.raises(SourceError, match="does not begin as"):
-        read(path)
+        read_all(path)

@@ -26,23 +26,27 @@ FORMAT = Format(
 BROKEN = Format("broken", "a log", lambda source: 1 / 0 > 0, lambda *_: 1 / 0)  # type: ignore[arg-type,return-value]
 
 
-def late() -> Content:
-    def samples() -> object:
+def load_failing_content() -> Content:
+    """Return content whose second sample raises an error."""
+
+    def iter_samples() -> object:
         yield Sample(1, "/cf1/height", "Height", {"height_m": 1.0})
         raise KeyError("altitude")
 
-    return Content(samples(), 5)  # type: ignore[arg-type]
+    return Content(iter_samples(), 5)  # type: ignore[arg-type]
 
 
-LATE = Format("late", "a log", lambda source: source.suffix == ".late", lambda *_: late())
+LATE = Format(
+    "late", "a log", lambda source: source.suffix == ".late", lambda *_: load_failing_content()
+)
 NONE = 1
 
 
 @pytest.fixture
 def plug(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
-    """Plug-ins of this module, by name and the name of what they load."""
+    """Return a function that installs plug-ins, by their names and variables of this module."""
 
-    def added(**values: str) -> None:
+    def install(**values: str) -> None:
         rows = {
             name: Plugin(
                 name,
@@ -54,7 +58,7 @@ def plug(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
         }
         monkeypatch.setattr(registry.entry_points, "find_plugins", lambda group: rows)
 
-    return added
+    return install
 
 
 def test_formats_are_listed_in_detection_order() -> None:
@@ -66,14 +70,15 @@ def test_formats_are_listed_in_detection_order() -> None:
 
 
 def test_the_sources_of_each_are_known(tmp_path: Path) -> None:
-    (tmp_path / "log").write_bytes(foreign.usd_log())
+    (tmp_path / "log").write_bytes(foreign.pack_usd_log())
     assert find_format(tmp_path / "log").name == "cfusdlog"
     folder = tmp_path / "pictures"
     folder.mkdir()
-    for name, data in foreign.coloured().items():
+    for name, data in foreign.encode_grey_image().items():
         (folder / name).write_bytes(data)
     assert find_format(folder).name == "images"
-    assert find_format(folder, "csv") is load_builtin_formats()["csv"]  # who says so is believed
+    # A format that the user names is not checked.
+    assert find_format(folder, "csv") is load_builtin_formats()["csv"]
 
 
 @pytest.mark.parametrize(
@@ -133,7 +138,7 @@ def test_plugin_formats_are_tried_after_built_in_ones_and_by_name(
     assert found.recognises(tmp_path / "a.theirs") and not found.recognises(tmp_path / "a.txt")
     err = capsys.readouterr().err
     assert "of the package their-logs, fails to check" in err and "Skipped for" in err
-    (tmp_path / "log").write_bytes(foreign.usd_log())
+    (tmp_path / "log").write_bytes(foreign.pack_usd_log())
     assert find_format(tmp_path / "log").name == "cfusdlog"
     assert find_format(tmp_path / "log", "theirs").name == "theirs"
     assert capsys.readouterr().err == ""

@@ -1,4 +1,4 @@
-"""Third-party images: pixel depth, order, hidden files, truncated files."""
+"""Third-party images: bit depth, order, hidden files and truncated files."""
 
 import io
 import json
@@ -20,7 +20,10 @@ Convert = Callable[..., dict[str, int]]
 
 @pytest.fixture
 def convert(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Convert:
-    """Run ``dmrl convert`` into out.mcap; return what was left out."""
+    """Return a function that runs ``dmrl convert`` into out.mcap.
+
+    The function returns the JSON document of the command, with standard error added.
+    """
 
     def run(source: Path, *flags: object) -> dict[str, int]:
         command: App = app
@@ -37,14 +40,14 @@ def convert(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Convert:
     return run
 
 
-def images(tmp_path: Path) -> list[np.ndarray]:
-    """Images of the recording out.mcap."""
+def read_images(tmp_path: Path) -> list[np.ndarray]:
+    """Return the images of the recording out.mcap."""
     return list(dmrl.open(tmp_path / "out.mcap").images("cf1"))
 
 
 def test_grey_of_16_bits_is_scaled(data: Path, convert: Convert, tmp_path: Path) -> None:
     told = convert(data / "strangers/picture-grey16/grey16")
-    assert abs(images(tmp_path)[0].mean() - 127) <= 1
+    assert abs(read_images(tmp_path)[0].mean() - 127) <= 1
     assert "16 bits scaled to 8, 65535 to 255 (--bits)" in told["stderr"]
 
 
@@ -54,16 +57,16 @@ def test_images_of_bags_have_their_colours(
     name: str, data: Path, convert: Convert, tmp_path: Path
 ) -> None:
     convert(data / f"strangers/ros-{name}/{name}")
-    found = images(tmp_path)
+    found = read_images(tmp_path)
     assert len(found) == 20
-    # A ramp over the columns, up to 38300 of 65535; and a mosaic with values of all of [0, 255].
+    # The ramp ends at 38300 of 65535. The mosaic has all values.
     assert found[0].max() == (149 if name == "only_mono16" else 255)
 
 
 def test_hidden_files_are_no_pictures(data: Path, convert: Convert, tmp_path: Path) -> None:
     told = convert(data / "strangers/picture-hidden_mac/hidden_mac")
     assert told["left_out"] == {}
-    assert len(images(tmp_path)) == 1
+    assert len(read_images(tmp_path)) == 1
 
 
 def test_names_are_in_natural_order(data: Path, convert: Convert, tmp_path: Path) -> None:
@@ -72,7 +75,7 @@ def test_names_are_in_natural_order(data: Path, convert: Convert, tmp_path: Path
     assert table.sort_values("log_time")["peers.u_px"].tolist() == [1, 2, 10]
 
 
-def test_normalised_coordinates_are_doubted(data: Path, convert: Convert) -> None:
+def test_normalised_coordinates_are_reported(data: Path, convert: Convert) -> None:
     told = convert(data / "strangers/labels-normalised_yolo/normalised_yolo")
     assert "doubt: 3 of 3 labels have u_px and v_px in [0, 1]" in told["stderr"]
 
@@ -82,20 +85,20 @@ def test_a_stream_of_jpegs_gets_the_size_of_the_network(
 ) -> None:
     source = data / "strangers/cpx-jpeg/jpeg.cpx"
     convert(source, "--width-px", 320, "--height-px", 224)
-    assert [image.shape for image in images(tmp_path)] == [(224, 320, 3)] * 6
+    assert [image.shape for image in read_images(tmp_path)] == [(224, 320, 3)] * 6
 
 
 def test_a_cut_jpeg_of_a_stream_is_left_out(data: Path, convert: Convert, tmp_path: Path) -> None:
     told = convert(data / "strangers/cpx-jpeg_half/jpeg_half.cpx")
     assert told["left_out"] == {"images that cannot be decoded": 1}
-    assert len(images(tmp_path)) == 5
+    assert len(read_images(tmp_path)) == 5
 
 
 RAMP = np.tile(np.linspace(0, 1, 64), (48, 1))
 
 
 def save(path: Path, picture: PIL.Image.Image, **more: object) -> None:
-    """Save a picture in the format that its name says."""
+    """Save an image in the format of its suffix."""
     picture.save(path, **more)
 
 
@@ -108,10 +111,10 @@ def test_every_depth_of_grey_becomes_the_same_ramp(
     (tmp_path / "in").mkdir()
     values = np.rint(RAMP * (2**bits - 1)).astype(np.uint16)
     assert cv2.imwrite(str(tmp_path / f"in/a.{suffix}"), values)
-    # The second picture is dark: its own maximum must not decide.
+    # The second image is dark. Its own maximum must not set the scale.
     assert cv2.imwrite(str(tmp_path / f"in/b.{suffix}"), values // 4)
     convert(tmp_path / "in", "--bits", bits)
-    bright, dark = images(tmp_path)
+    bright, dark = read_images(tmp_path)
     assert np.abs(bright[..., 0] - RAMP * 255).max() <= 0.6
     assert np.abs(dark[..., 0] - RAMP * 255 / 4).max() <= 0.8
 
@@ -127,7 +130,7 @@ def test_colours_of_every_depth_are_scaled(
     bgr = np.rint(shares * (2**bits - 1)).astype(np.uint16)
     assert cv2.imwrite(str(tmp_path / f"in/a.{suffix}"), bgr)
     told = convert(tmp_path / "in", "--bits", bits)
-    (image,) = images(tmp_path)
+    (image,) = read_images(tmp_path)
     assert np.abs(image - shares[..., 2::-1] * 255).max() <= 1
     assert f"16 bits scaled to 8, {2**bits - 1} to 255" in told["stderr"]
 
@@ -135,7 +138,8 @@ def test_colours_of_every_depth_are_scaled(
 COLOURS = np.random.default_rng(0).integers(0, 256, (48, 64, 3), np.uint8)
 
 
-def _palette() -> PIL.Image.Image:
+def _make_palette_image() -> PIL.Image.Image:
+    """Return an image of 64 colours with a palette."""
     return PIL.Image.fromarray(COLOURS // 64 * 64).quantize(64, dither=PIL.Image.Dither.NONE)
 
 
@@ -148,8 +152,8 @@ def _palette() -> PIL.Image.Image:
         ("a.png", lambda: PIL.Image.fromarray(COLOURS).convert("RGBA"), 0),
         ("a.png", lambda: PIL.Image.fromarray(np.dstack([COLOURS, COLOURS[..., :1]])), 0),
         ("a.tif", lambda: PIL.Image.fromarray(COLOURS).convert("CMYK"), 3),
-        ("a.gif", _palette, 64),
-        ("a.png", _palette, 64),
+        ("a.gif", _make_palette_image, 64),
+        ("a.png", _make_palette_image, 64),
     ],
 )
 def test_images_opened_by_pillow_become_rgb(
@@ -162,7 +166,7 @@ def test_images_opened_by_pillow_become_rgb(
     (tmp_path / "in").mkdir()
     save(tmp_path / "in" / name, make(), **({"lossless": True} if "webp" in name else {}))
     assert convert(tmp_path / "in")["left_out"] == {}
-    (image,) = images(tmp_path)
+    (image,) = read_images(tmp_path)
     assert np.abs(image.astype(int) - COLOURS).max() <= apart
 
 
@@ -170,10 +174,10 @@ def test_images_opened_by_pillow_become_rgb(
 def test_exif_orientation_is_applied(as_stored: bool, convert: Convert, tmp_path: Path) -> None:
     (tmp_path / "in").mkdir()
     exif = PIL.Image.Exif()
-    exif[0x0112] = 6  # to be turned by 90 degrees clockwise
+    exif[0x0112] = 6  # rotate by 90 degrees clockwise
     save(tmp_path / "in/a.png", PIL.Image.fromarray(COLOURS), exif=exif)
     told = convert(tmp_path / "in", *["--as-stored"] * as_stored)
-    (image,) = images(tmp_path)
+    (image,) = read_images(tmp_path)
     assert (image == (COLOURS if as_stored else np.rot90(COLOURS, -1))).all()
     assert ("turned upright by EXIF" in told["stderr"]) != as_stored
 
@@ -187,12 +191,13 @@ def test_first_image_of_a_multi_image_file_is_used(
     more = {"lossless": True} if "webp" in name else {}
     save(tmp_path / "in" / name, frames[0], save_all=True, append_images=frames[1:], **more)
     told = convert(tmp_path / "in")
-    (image,) = images(tmp_path)
+    (image,) = read_images(tmp_path)
     assert (image == 10).all()
     assert "1 pictures: one image of several used, the first" in told["stderr"]
 
 
 def _cut(data: bytes) -> bytes:
+    """Return the first half of a file."""
     return data[: len(data) // 2]
 
 
@@ -221,7 +226,7 @@ def test_a_picture_that_is_broken_is_left_out_with_its_labels(
     assert name in told["stderr"]
     recording = dmrl.open(tmp_path / "out.mcap")
     assert recording["/cf1/labels"].to_pandas()["log_time"].astype(int).tolist() == [0, 200_000_000]
-    assert len(images(tmp_path)) == 2
+    assert len(read_images(tmp_path)) == 2
 
 
 def test_floats_have_no_range(convert: Convert, tmp_path: Path) -> None:
@@ -264,9 +269,7 @@ def test_names_are_seconds_if_all_are(
     assert ("taken for times in seconds" in output) == (times[0] != 0)
 
 
-def test_depths_in_millimetres_and_boxes_elsewhere_are_doubted(
-    convert: Convert, tmp_path: Path
-) -> None:
+def test_implausible_depths_boxes_and_peers_are_reported(convert: Convert, tmp_path: Path) -> None:
     (tmp_path / "in").mkdir()
     (tmp_path / "in/a.png").write_bytes(encode_png(COLOURS))
     (tmp_path / "in/labels.csv").write_text(

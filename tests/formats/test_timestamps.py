@@ -1,3 +1,5 @@
+"""Counters are unwrapped, and the jitter of arrival times is removed."""
+
 import math
 from fractions import Fraction
 from itertools import combinations
@@ -29,7 +31,7 @@ def test_values_out_of_order_stay_so() -> None:
 def test_jitter_of_arrival_is_taken_away(drop: float, counted: bool) -> None:
     rng = np.random.default_rng(1)
     number = np.flatnonzero(rng.random(4000) >= drop)
-    sent = 10**18 + number * 50_050_000  # a clock that is 0.1 % slow
+    sent = 10**18 + number * 50_050_000  # the sender's clock is 0.1 % slow
     arrival = np.maximum.accumulate(sent + rng.exponential(2e6, len(number)).astype(np.int64))
     found = dejitter(arrival, number if counted else None)
     assert (found <= arrival).all()
@@ -98,7 +100,7 @@ def test_gap_is_detected_at_0_7_periods_after_the_due_time() -> None:
 
 
 def test_due_time_follows_early_arrivals_with_gain_0_3() -> None:
-    # Early by 20 of 100, then late by 6: due at 994, then 1094.06.
+    # At a period of 100, arrivals are 20 early, then 6 late. They are due at 994 and at 1094.06.
     steady = [*(100 * k for k in range(10)), 980, 1100]
     for last, number in ((1263, 12), (1265, 13)):
         assert _number_arrivals(np.array([*steady, last]))[-1] == number
@@ -108,7 +110,7 @@ def test_lower_hull_is_convex_and_takes_the_lowest_of_equal_x() -> None:
     x = np.array([0.0, 1, 1, 2, 3, 3, 4])
     assert _lower_hull(x, np.array([5.0, 2, 1, 3, 0, 4, 4])) == [0, 2, 4, 6]
     assert _lower_hull(x[:3], np.array([0.0, 1, 2])) == [0, 1]
-    assert _lower_hull(np.arange(3.0), np.array([0.0, 1, 2])) == [0, 2]  # no corner on a line
+    assert _lower_hull(np.arange(3.0), np.array([0.0, 1, 2])) == [0, 2]  # collinear
 
 
 @pytest.mark.parametrize("count", [None, [7, 8, 9, 11, 12, 13]])
@@ -122,7 +124,7 @@ def test_steady_rate_filter_starts_at_the_eighth_arrival() -> None:
     sender = SteadyRateFilter()
     arrivals = [0, 60, 90, 160, 195, 260, 300]
     assert [sender(a * MS) for a in arrivals] == [a * MS for a in arrivals]
-    # At a pace of 352 / 7 it is due 50.3 ms after the seventh, and a fiftieth of the rest later.
+    # At a period of 352 / 7 ms it is due 50.3 ms after the seventh, plus 1/50 of the delay.
     pace = 352 / 7
     assert sender(352 * MS) == pytest.approx((300 + pace + 0.02 * (52 - pace)) * MS, abs=1)
 
@@ -131,7 +133,7 @@ def test_rate_is_estimated_from_the_last_64_arrivals() -> None:
     sender, now = SteadyRateFilter(), 0
     for step in [50] * 100 + [40] * 64:
         now += step * MS
-        assert sender(now) == now  # early arrivals are followed at once
+        assert sender(now) == now  # an early arrival is taken as it is
     pace = (62 * 40 + 50) / 63
     assert sender(now + 50 * MS) == pytest.approx(now + (pace + 0.02 * (50 - pace)) * MS, abs=1)
 
@@ -141,7 +143,7 @@ def test_a_pause_is_of_more_than_four_paces(late: float, stands: bool) -> None:
     sender = SteadyRateFilter()
     for k in range(64):
         sender(50 * MS * k)
-    # The pace itself grows a little: (62 + 1 + late) / 63 of what it was.
+    # The late arrival increases the period to (62 + 1 + late) / 63 of its value.
     after = round(50 * MS * (64 + late))
     assert (sender(after) == after) == stands
     again = [after + step * MS for step in (30, 90, 170, 200, 270, 310)]
@@ -149,7 +151,7 @@ def test_a_pause_is_of_more_than_four_paces(late: float, stands: bool) -> None:
 
 
 def test_nothing_is_sent_after_it_arrived_on_a_clock_of_today() -> None:
-    """Where a float is a quarter of a microsecond coarse."""
+    """On a clock of today, a float resolves only a quarter of a microsecond."""
     rng, sender = np.random.default_rng(4), SteadyRateFilter()
     steps = rng.integers(49 * MS, 51 * MS, 300)
     for arrival in (17 * 10**17 + np.cumsum(steps)).tolist():
@@ -162,8 +164,8 @@ def test_three_arrivals_are_evened_out_and_two_stand() -> None:
     assert dejitter([]).tolist() == []
 
 
-def plain_line(x: list[int], y: list[int]) -> list[int]:
-    """Of all lines through two points with none below, the one that is highest on average."""
+def fit_line_below(x: list[int], y: list[int]) -> list[int]:
+    """Return the values of the highest line below all points, found by trying all pairs."""
     best: tuple[Fraction, Fraction, Fraction] | None = None
     for (a, b), (c, d) in combinations(list(zip(x, y, strict=True)), 2):
         slope = Fraction(d - b, c - a)
@@ -184,7 +186,7 @@ def test_times_follow_the_highest_line_below_all_arrivals(
     number = np.cumsum([step for step, _ in steps])
     arrival = 100 * number + np.array([late for _, late in steps])
     found = dejitter(10**15 + arrival, number) - 10**15
-    line = plain_line(number.tolist(), arrival.tolist())
-    # Of two lines as high on average, either will do.
+    line = fit_line_below(number.tolist(), arrival.tolist())
+    # If two lines have the same mean, either is correct.
     assert (found <= arrival).all()
     assert found.tolist() == line or abs(found.sum() - sum(line)) <= len(line)

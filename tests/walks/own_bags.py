@@ -1,6 +1,6 @@
-"""Bags of own robots: odometry, ranges and motion capture, as a ROS driver writes them.
+"""Bags of simulated robots with odometry, ranges and motion capture, as a ROS driver writes them.
 
-Nothing of dmrl's readers or writers is in here: messages are made by rosbags alone.
+Messages are made by rosbags, independently of dmrl's readers and writers.
 """
 
 from collections.abc import Iterator
@@ -21,13 +21,13 @@ Array = NDArray[np.float64]
 Message = tuple[str, str, int, Any]
 """Topic, type, time in nanoseconds, message."""
 BORN_S = 1_772_000_000
-"""True time zero, since 1970."""
+"""Time since 1970 at the start of a flight."""
 EVERY = 2
-"""Of the simulated samples, each second one is odometry."""
+"""Every second simulated sample becomes an odometry message."""
 
 
-def turned(roll: float, pitch: float, yaw: float) -> Array:
-    """Body to world, Rz(yaw) Ry(pitch) Rx(roll)."""
+def make_rotation(roll: float, pitch: float, yaw: float) -> Array:
+    """Return the (3, 3) matrix world from body: Rz(yaw) Ry(pitch) Rx(roll), radians."""
     cr, sr, cp, sp = np.cos(roll), np.sin(roll), np.cos(pitch), np.sin(pitch)
     c, s = np.cos(yaw), np.sin(yaw)
     about_z = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
@@ -43,14 +43,14 @@ class Bag:
     Parameters
     ----------
     flight
-        What was flown; its robots' clocks are those of the headers.
+        The simulated flight. Headers have the clocks of its robots.
     version
-        Of ROS.
+        Version of ROS, 1 or 2.
     moving_frame
-        ``body``: twists are in the body's frame, as REP 105 and the message say. ``world``: in
-        the frame of the pose, and the message says so.
+        Frame of the twists: ``body``, as REP 105 requires, or ``world``, the frame of the pose.
+        ``child_frame_id`` names it.
     late_s
-        How long after its header a message came to the bag.
+        Delay between the stamp of a message and its receipt, seconds.
     """
 
     flight: Flight
@@ -61,53 +61,55 @@ class Bag:
 
     @property
     def store(self) -> Any:
+        """Return the message types of the version of ROS."""
         return get_typestore(Stores.ROS1_NOETIC if self.version == 1 else Stores.ROS2_HUMBLE)
 
-    def header(self, time_s: float, frame: str, robot: str = "") -> Any:
+    def make_header(self, time_s: float, frame: str, robot: str = "") -> Any:
+        """Return a header with a time of a robot's clock."""
         types = self.store.types
-        time_ns = self.ns(time_s, robot)
+        time_ns = self.to_ns(time_s, robot)
         clock = types["builtin_interfaces/msg/Time"]
         stamp = clock(sec=time_ns // 10**9, nanosec=time_ns % 10**9)
         more = {"seq": 0} if self.version == 1 else {}
         return types["std_msgs/msg/Header"](stamp=stamp, frame_id=frame, **more)
 
-    def ns(self, time_s: float, robot: str = "") -> int:
-        """Of a robot's clock; robots that were given a start of their own count from it."""
+    def to_ns(self, time_s: float, robot: str = "") -> int:
+        """Return a time of a robot's clock in nanoseconds, counted from its own start if given."""
         return round((self.born_s.get(robot, BORN_S) + time_s) * 1e9)
 
     def write(self, path: Path, storage: str = "sqlite3") -> Path:
-        """A ROS 1 file, or a rosbag2 folder."""
+        """Write a ROS 1 file or a rosbag2 folder."""
         version: dict[str, Any] = {"version": 9, "storage_plugin": StoragePlugin[storage.upper()]}
         store = self.store
         ready = store.serialize_ros1 if self.version == 1 else store.serialize_cdr
         with Writer1(path) if self.version == 1 else Writer2(path, **version) as writer:
             known: dict[str, Any] = {}
-            for topic, kind, time_ns, message in sorted(self.messages(), key=lambda m: m[2]):
+            for topic, kind, time_ns, message in sorted(self.iter_messages(), key=lambda m: m[2]):
                 if topic not in known:
                     known[topic] = writer.add_connection(topic, kind, typestore=store)
                 writer.write(known[topic], time_ns, ready(message, kind))
         return path
 
-    def messages(self) -> Iterator[Message]:
-        """All of the flight, robot by robot."""
+    def iter_messages(self) -> Iterator[Message]:
+        """Yield all messages of the flight, robot by robot."""
         late_ns = round(self.late_s * 1e9)
         for robot, log in self.flight.robots.items():
             true_s = self.flight.clocks[robot].to_true_time(log.time_s)
-            for k, odometry in self.odometry(robot, log):
-                arrived = self.ns(true_s[k]) + late_ns
+            for k, odometry in self.iter_odometry(robot, log):
+                arrived = self.to_ns(true_s[k]) + late_ns
                 yield f"/{robot}/odom", "nav_msgs/msg/Odometry", arrived, odometry
-            yield from self.captured(robot)
+            yield from self.iter_captured(robot)
         ranged = self.store.types["sensor_msgs/msg/Range"]
         for (robot, peer), measured in self.flight.ranges.items():
             true_s = self.flight.clocks[robot].to_true_time(measured.time_s)
             for here_s, true, value in zip(measured.time_s, true_s, measured.range_m, strict=True):
-                head = self.header(here_s, f"{robot}_uwb", robot)
+                head = self.make_header(here_s, f"{robot}_uwb", robot)
                 message = ranged(head, 0, 0.0, 0.1, 50.0, float(value))
-                arrived = self.ns(true) + late_ns
+                arrived = self.to_ns(true) + late_ns
                 yield f"/{robot}/uwb/{peer}", "sensor_msgs/msg/Range", arrived, message
 
-    def odometry(self, robot: str, log: RobotLog) -> Iterator[tuple[int, Any]]:
-        """Dead reckoning from where the robot took off, with its twist."""
+    def iter_odometry(self, robot: str, log: RobotLog) -> Iterator[tuple[int, Any]]:
+        """Yield number and message of dead reckoning from the position of take-off."""
         types = self.store.types
         step_s = np.gradient(log.time_s)
         yaw = np.cumsum(log.yaw_rate_radps * step_s)
@@ -117,49 +119,53 @@ class Bag:
         vz = np.zeros_like(x)
         for k in range(0, len(x), EVERY):
             roll, pitch = log.roll_rad[k], log.pitch_rad[k]
-            body = turned(roll, pitch, yaw[k])
-            level = turned(0.0, 0.0, yaw[k])
+            body = make_rotation(roll, pitch, yaw[k])
+            level = make_rotation(0.0, 0.0, yaw[k])
             world = level @ np.array([log.vx_mps[k], log.vy_mps[k], vz[k]])
             twist = world if self.moving_frame == "world" else body.T @ world
             rate = log.yaw_rate_radps[k] * np.cos(pitch) / np.cos(roll)
             pose = types["geometry_msgs/msg/Pose"](
-                self.point(x[k], y[k], log.height_m[k]), self.quaternion(roll, pitch, yaw[k])
+                self.make_point(x[k], y[k], log.height_m[k]),
+                self.make_quaternion(roll, pitch, yaw[k]),
             )
             moving = types["geometry_msgs/msg/Twist"](
-                self.vector(*twist), self.vector(0.0, 0.0, rate)
+                self.make_vector(*twist), self.make_vector(0.0, 0.0, rate)
             )
             child = "odom" if self.moving_frame == "world" else f"{robot}/base_link"
             yield (
                 k,
                 types["nav_msgs/msg/Odometry"](
-                    self.header(log.time_s[k], "odom", robot),
+                    self.make_header(log.time_s[k], "odom", robot),
                     child,
                     types["geometry_msgs/msg/PoseWithCovariance"](pose, np.zeros(36)),
                     types["geometry_msgs/msg/TwistWithCovariance"](moving, np.zeros(36)),
                 ),
             )
 
-    def captured(self, robot: str) -> Iterator[Message]:
-        """Poses of motion capture, on its own clock, which is the true one."""
+    def iter_captured(self, robot: str) -> Iterator[Message]:
+        """Yield the true poses of motion capture, whose clock is exact."""
         types = self.store.types
         truth = self.flight.truth[robot]
         for k in range(0, len(truth.time_s), EVERY):
             pose = types["geometry_msgs/msg/Pose"](
-                self.point(*truth.position[k]),
-                self.quaternion(truth.roll[k], truth.pitch[k], truth.yaw[k]),
+                self.make_point(*truth.position[k]),
+                self.make_quaternion(truth.roll[k], truth.pitch[k], truth.yaw[k]),
             )
-            head = self.header(truth.time_s[k], "map")
+            head = self.make_header(truth.time_s[k], "map")
             message = types["geometry_msgs/msg/PoseStamped"](head, pose)
             topic = f"/vrpn_client_node/{robot}/pose"
-            yield topic, "geometry_msgs/msg/PoseStamped", self.ns(truth.time_s[k]), message
+            yield topic, "geometry_msgs/msg/PoseStamped", self.to_ns(truth.time_s[k]), message
 
-    def point(self, *xyz: float) -> Any:
+    def make_point(self, *xyz: float) -> Any:
+        """Return a Point, metres."""
         return self.store.types["geometry_msgs/msg/Point"](*(float(value) for value in xyz))
 
-    def vector(self, *xyz: float) -> Any:
+    def make_vector(self, *xyz: float) -> Any:
+        """Return a Vector3."""
         return self.store.types["geometry_msgs/msg/Vector3"](*(float(value) for value in xyz))
 
-    def quaternion(self, roll: float, pitch: float, yaw: float) -> Any:
+    def make_quaternion(self, roll: float, pitch: float, yaw: float) -> Any:
+        """Return the Quaternion of Euler angles, radians."""
         halves = np.array([roll, pitch, yaw]) / 2
         (cr, cp, cy), (sr, sp, sy) = np.cos(halves), np.sin(halves)
         values = (

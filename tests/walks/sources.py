@@ -1,4 +1,4 @@
-"""A small source of every kind in docs/sources.md, and ways to damage one."""
+"""A small source of every kind in docs/sources.md, and functions that damage a file."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -10,11 +10,11 @@ from ..formats import foreign
 from ..formats.test_fuzz import SOURCES as BINARY
 
 Made = tuple[Path, Path]
-"""A source, and the one file of it that is damaged."""
+"""A source, and the file of it that is damaged."""
 
 
-def client_log(folder: Path) -> Made:
-    """Two log blocks of the Crazyflie client."""
+def write_client_log(folder: Path) -> Made:
+    """Write two log blocks of the Crazyflie client."""
     names = ("vx", "vy", "z", "roll", "pitch", "yaw")
     head = ",".join(f"stateEstimate.{name}" for name in names)
     rows = [f"{1000 + 10 * k},0.5,0.1,1.0,1.5,2.5,{0.1 * k:.1f}" for k in range(50)]
@@ -27,8 +27,8 @@ def client_log(folder: Path) -> Made:
     return folder / "cf1", path
 
 
-def flight_logs(folder: Path) -> Made:
-    """Two robots in our own tables."""
+def write_flight_logs(folder: Path) -> Made:
+    """Write the CSV logs of two robots with dmrl's own columns."""
     columns = "time_s,roll_rad,pitch_rad,yaw_rate_radps,vx_mps,vy_mps,height_m"
     flight = folder / "flight"
     flight.mkdir()
@@ -39,8 +39,8 @@ def flight_logs(folder: Path) -> Made:
     return flight, flight / "cf2.csv"
 
 
-def somebodys_csv(folder: Path) -> Made:
-    """Fifty rows that have the columns of NanoBench."""
+def write_nanobench(folder: Path) -> Made:
+    """Write fifty rows with the columns of NanoBench."""
     from dmrl.formats.files.column_map import read_column_map  # noqa: PLC0415
     from dmrl.formats.files.mapped_csv import NANOBENCH_TABLE  # noqa: PLC0415
 
@@ -51,20 +51,20 @@ def somebodys_csv(folder: Path) -> Made:
     return path, path
 
 
-def pictures(folder: Path) -> Made:
-    """Pictures with labels; the labels are damaged."""
+def write_pictures(folder: Path) -> Made:
+    """Write images and labels; the file of labels is damaged."""
     source = folder / "pictures"
     source.mkdir()
-    for name, data in foreign.coloured().items():
+    for name, data in foreign.encode_grey_image().items():
         (source / name).write_bytes(data)
-    rows = [f"{name},cf2,10.5,8.5,1.2,hand" for name in sorted(foreign.coloured())]
+    rows = [f"{name},cf2,10.5,8.5,1.2,hand" for name in sorted(foreign.encode_grey_image())]
     path = source / "labels.csv"
     path.write_text("\n".join(["file,peer,u_px,v_px,depth_m,source", *rows]) + "\n")
     return source, path
 
 
-def published(data: Path) -> Callable[[Path], Made]:
-    """A part of the published set."""
+def make_published_writer(data: Path) -> Callable[[Path], Made]:
+    """Return a function that copies a part of the published set."""
 
     def make(folder: Path) -> Made:
         source = folder / "published"
@@ -76,38 +76,38 @@ def published(data: Path) -> Callable[[Path], Made]:
 
 KINDS: dict[str, Callable[[Path], Made]] = {
     **{which: make for which, (_, make) in BINARY.items()},
-    "cfclient": client_log,
-    "csv": flight_logs,
-    "columns": somebodys_csv,
-    "labels of pictures": pictures,
+    "cfclient": write_client_log,
+    "csv": write_flight_logs,
+    "columns": write_nanobench,
+    "labels of pictures": write_pictures,
 }
 
 
-def cut(data: bytes) -> bytes:
-    """The last two fifths are missing, as after a flat battery."""
+def truncate(data: bytes) -> bytes:
+    """Drop the last two fifths, as after an empty battery."""
     return data[: len(data) * 3 // 5]
 
 
-def emptied(_: bytes) -> bytes:
-    """Nothing was written."""
+def empty(_: bytes) -> bytes:
+    """Drop everything."""
     return b""
 
 
-def scrambled(data: bytes) -> bytes:
-    """Sixty-four bytes in the middle are those of another file."""
+def overwrite_middle(data: bytes) -> bytes:
+    """Replace 64 bytes in the middle by random ones."""
     at = len(data) // 2
     noise = np.random.default_rng(at).integers(0, 256, 64, np.uint8).tobytes()
     return data[:at] + noise + data[at + 64 :]
 
 
-def exchanged(_: bytes) -> bytes:
-    """A text of another kind has its name."""
+def replace_by_text(_: bytes) -> bytes:
+    """Replace everything by a text of another kind."""
     return b"Dear diary,\ntoday the drones flew.\n" * 40
 
 
-def doubled(data: bytes) -> bytes:
-    """It was copied onto its own end."""
+def double(data: bytes) -> bytes:
+    """Append a copy."""
     return data + data
 
 
-DAMAGES = (cut, emptied, scrambled, exchanged, doubled)
+DAMAGES = (truncate, empty, overwrite_middle, replace_by_text, double)

@@ -1,8 +1,7 @@
 """Sources of every kind, each damaged in five ways.
 
-What a person must see is one of two things. A line that names the file and the way out, and then
-there is no recording. Or a recording of all that is whole, and then a line that says what is not:
-nothing is lost in silence.
+Either a one-line error names the file and no recording is written, or the recording holds the
+undamaged part and a line reports what was lost.
 """
 
 from pathlib import Path
@@ -19,8 +18,8 @@ from . import sources
 pytestmark = pytest.mark.slow
 
 
-def converted(source: Path, out: Path, kind: str | None = None) -> dict[str, int]:
-    """Messages of a source by topic, as the command counts them."""
+def convert_source(source: Path, out: Path, kind: str | None = None) -> dict[str, int]:
+    """Convert a source; return the number of messages by topic."""
     return convert.run(source, out, convert.Settings(kind, robot="cf1"))
 
 
@@ -36,13 +35,13 @@ def test_damage_is_refused_or_reported(
 ) -> None:
     source, path = sources.KINDS[kind](tmp_path)
     name = find_format(source).name if said_kind else None
-    whole = converted(source, tmp_path / "whole.mcap")
+    whole = convert_source(source, tmp_path / "whole.mcap")
     capsys.readouterr()
     before = path.read_bytes()
     path.write_bytes(damage(before))
     out = tmp_path / "out.mcap"
     try:
-        counts = converted(source, out, name)
+        counts = convert_source(source, out, name)
     except DmrlError as e:
         assert not out.exists() and not [*tmp_path.glob("*.partial")]
         assert "\n" not in str(e) and len(str(e)) <= ERROR_CHARACTERS_MAX
@@ -50,7 +49,7 @@ def test_damage_is_refused_or_reported(
         return
     output = capsys.readouterr().err
     lost = {topic: count for topic, count in whole.items() if counts.get(topic, 0) < count}
-    assert not lost or output, f"lost without a word: {lost}"
+    assert not lost or output, f"lost without a report: {lost}"
 
 
 @pytest.mark.parametrize("damage", sources.DAMAGES, ids=lambda damage: damage.__name__)
@@ -62,14 +61,14 @@ def test_damage_of_the_published_set_is_refused_or_reported(
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    source, _ = sources.published(data)(tmp_path)
+    source, _ = sources.make_published_writer(data)(tmp_path)
     path = source / name
     if not path.is_file():
         path = next(p for p in sorted(source.rglob("*.txt")))
     path.write_bytes(damage(path.read_bytes()))
     try:
-        converted(source, tmp_path / "out.mcap")
+        convert_source(source, tmp_path / "out.mcap")
     except DmrlError as e:
         assert "\n" not in str(e) and (path.name in str(e) or source.name in str(e))
         return
-    assert damage is not sources.cut or capsys.readouterr().err
+    assert damage is not sources.truncate or capsys.readouterr().err

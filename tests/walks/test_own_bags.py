@@ -1,7 +1,7 @@
-"""Convert bags of three own robots, recorded with ROS, with motion capture beside them.
+"""Bags of three simulated robots with motion capture are converted, aligned and labelled.
 
-Tested are the three formats of bags, velocities in the frame of odometry, robots whose clocks
-begin at their own boot, and a log that begins before time zero.
+The tests cover the three formats of bags, velocities in the frame of odometry, clocks that start
+at boot, and a log that starts before time zero.
 """
 
 from pathlib import Path
@@ -25,10 +25,12 @@ ROBOTS = ("cf1", "cf2", "cf3")
 
 @pytest.fixture(scope="module")
 def flight() -> Flight:
+    """Return a simulated flight of three robots over 40 s."""
     return simulate(Scenario(robots=3, duration_s=40.0), NOISE["calibrated"], seed=21)
 
 
-def taken(source: Path, out: Path) -> Path:
+def convert_and_check(source: Path, out: Path) -> Path:
+    """Convert a bag to a recording without findings; return it."""
     convert.run(source, out, convert.Settings())
     assert not check(out)
     return out
@@ -40,7 +42,7 @@ def test_all_bag_formats_give_equal_recordings(flight: Flight, tmp_path: Path, k
         bag = Bag(flight, version=1).write(tmp_path / "flight.bag")
     else:
         bag = Bag(flight).write(tmp_path / "flight", kind)
-    out = taken(bag, tmp_path / "flight.mcap")
+    out = convert_and_check(bag, tmp_path / "flight.mcap")
     for robot in ROBOTS:
         log, every = flight.robots[robot], slice(None, None, 2)
         velocity = read_table(out, f"/{robot}/velocity")
@@ -49,19 +51,19 @@ def test_all_bag_formats_give_equal_recordings(flight: Flight, tmp_path: Path, k
             np.testing.assert_allclose(velocity[field], getattr(log, field)[every], atol=1e-5)
         for field in ("roll_rad", "pitch_rad", "yaw_rate_radps"):
             np.testing.assert_allclose(attitude[field], getattr(log, field)[every], atol=1e-5)
-    # Two robots, two directions each, and none of a robot called "uwb".
+    # Each pair of robots has ranges both ways, and no robot is called "uwb".
     links = [topic for topic in read_summary(out).topics if "/range/" in topic]
     assert links == sorted(f"/{a}/range/{b}" for a in ROBOTS for b in ROBOTS if a != b)
 
 
 def test_odometry_velocities_are_rotated_to_the_robot(flight: Flight, tmp_path: Path) -> None:
     bag = Bag(flight, moving_frame="world").write(tmp_path / "flight")
-    out = taken(bag, tmp_path / "flight.mcap")
+    out = convert_and_check(bag, tmp_path / "flight.mcap")
     velocity = read_table(out, "/cf2/velocity")
     np.testing.assert_allclose(velocity["vx_mps"], flight.robots["cf2"].vx_mps[::2], atol=1e-5)
     label.run(out, tmp_path / "labelled.mcap", label.Settings())
     judged = positions.judge(tmp_path / "labelled.mcap")
-    assert len(judged) == 6  # by the motion capture of the bag
+    assert len(judged) == 6  # judged by the motion capture of the bag
     kept = np.concatenate([np.hypot(*p.judged.error_m[p.judged.kept].T) for p in judged])
     assert len(kept) > 2000 and np.median(kept) < 0.12
 

@@ -1,8 +1,4 @@
-"""Convert logs of own drones, from micro-SD cards and from a notebook's folder.
-
-Tested are micro-SD logs with any variables, flights that others published as CSV, and two robots
-whose clocks began at their own boots.
-"""
+"""Logs of drones are converted: micro-SD logs, published CSV flights, and clocks since boot."""
 
 from pathlib import Path
 
@@ -26,7 +22,7 @@ def test_every_sd_card_log_gives_motion_or_a_reason(
         output = capsys.readouterr().err
         for topic, reason in (("attitude", "no attitude: no"), ("velocity", "no velocity: no")):
             assert (f"/cf7/{topic}" in counts) != (reason in output), (card.name, topic)
-        # Whatever was logged is there, and the licence that lay beside it.
+        # All logged variables are there, and the licence of the folder.
         assert counts["/cf7/log/fixedFrequency"] > 2500
         assert read_summary(out).metadata["dmrl.licences"] == [{card.name: "MIT License"}]
         assert not [finding for finding in check(out) if finding.level == "error"]
@@ -47,7 +43,7 @@ def test_third_party_csv_flights_are_read_by_column_map(data: Path, tmp_path: Pa
 
 
 def test_two_clocks_are_aligned(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """cf2 was switched on 37 s after cf1, and both ranged to each other for a minute."""
+    """The clocks of the two robots differ by 100 s. Their ranges to each other align them."""
     rng = np.random.default_rng(0)
     time_s = np.cumsum(rng.uniform(0.03, 0.05, 1500))
     range_m = 3 + 0.5 * np.sin(time_s) + 0.4 * np.sin(1.7 * time_s) + rng.normal(0, 0.05, 1500)

@@ -14,7 +14,7 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture
 def pictures(tmp_path: Path) -> Path:
-    """Thirty pictures; the labels of a tool that counts rows from another edge are 10 px low."""
+    """Return 30 labelled images and one without a label; all labels are 10 px too low."""
     folder = tmp_path / "hall"
     folder.mkdir()
     (folder / "LICENSE").write_text("CC BY 4.0\n")
@@ -38,7 +38,7 @@ def test_own_images_become_a_dataset_with_a_complete_card(
 ) -> None:
     recording = tmp_path / "hall.mcap"
     convert.run(pictures, recording, convert.Settings())
-    # The bias is told the moment the recording is made.
+    # The bias is already reported by the conversion.
     assert "labels of source 'hand' are biased: " in capsys.readouterr().err
     with pytest.raises(SettingError, match="has no masks"):
         dataset.run([recording], tmp_path / "d", dataset.Settings(masks=True))

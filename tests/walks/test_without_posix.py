@@ -1,7 +1,6 @@
-"""Commands start and work where modules, functions and signals of POSIX are missing.
+"""Commands work where modules, functions and signals of POSIX are missing.
 
-This is not Windows: it shows that nothing that only POSIX has is needed. README.md says what was
-tried on which system.
+This does not replace a test on Windows. README.md states what was tried on which system.
 """
 
 import subprocess
@@ -13,7 +12,7 @@ import pytest
 pytestmark = [pytest.mark.heavy, pytest.mark.timeout(1200)]
 HIDE = """
 import os, signal, sys
-import multiprocessing, subprocess, tempfile  # their own use of POSIX is not in question
+import multiprocessing, subprocess, tempfile  # the standard library may use POSIX
 for name in ("fcntl", "resource", "termios", "pwd", "grp"):
     sys.modules[name] = None
 for name in ("fork", "killpg", "sched_getaffinity", "sched_setaffinity"):
@@ -28,7 +27,8 @@ main()
 """
 
 
-def dmrl(place: Path, *words: str) -> str:
+def run_dmrl(place: Path, *words: str) -> str:
+    """Run a command without POSIX; return its standard output."""
     line = [sys.executable, "-c", HIDE, *words]
     done = subprocess.run(line, cwd=place, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
@@ -37,17 +37,17 @@ def dmrl(place: Path, *words: str) -> str:
 
 
 def test_the_first_commands_work_without_posix(tmp_path: Path) -> None:
-    assert "Usage: dmrl train" in dmrl(tmp_path, "train", "--help")
-    dmrl(tmp_path, "sketch", "pictures", "--images", "24")
-    dmrl(tmp_path, "convert", "pictures", "pictures.mcap")
-    assert "/cf1/labels" in dmrl(tmp_path, "info", "pictures.mcap")
-    dmrl(tmp_path, "check", "pictures.mcap")
-    dmrl(tmp_path, "dataset", "pictures.mcap", "dataset")
-    dmrl(tmp_path, "train", "dataset", "model", "--epochs", "1")
-    dmrl(tmp_path, "predict", "model", "pictures.mcap", "seen.mcap")
-    dmrl(tmp_path, "export", "dmrl-nano", "network")
-    dmrl(tmp_path, "fly", "fly_in_view", "flight.mcap", "--duration-s", "20")
-    dmrl(tmp_path, "label", "flight.mcap", "labelled.mcap")
+    assert "Usage: dmrl train" in run_dmrl(tmp_path, "train", "--help")
+    run_dmrl(tmp_path, "sketch", "pictures", "--images", "24")
+    run_dmrl(tmp_path, "convert", "pictures", "pictures.mcap")
+    assert "/cf1/labels" in run_dmrl(tmp_path, "info", "pictures.mcap")
+    run_dmrl(tmp_path, "check", "pictures.mcap")
+    run_dmrl(tmp_path, "dataset", "pictures.mcap", "dataset")
+    run_dmrl(tmp_path, "train", "dataset", "model", "--epochs", "1")
+    run_dmrl(tmp_path, "predict", "model", "pictures.mcap", "seen.mcap")
+    run_dmrl(tmp_path, "export", "dmrl-nano", "network")
+    run_dmrl(tmp_path, "fly", "fly_in_view", "flight.mcap", "--duration-s", "20")
+    run_dmrl(tmp_path, "label", "flight.mcap", "labelled.mcap")
     made = {path.name for path in tmp_path.iterdir()}
     assert {"dataset", "model", "seen.mcap", "network", "labelled.mcap"} <= made
     assert not [name for name in made if name.endswith(".partial")]

@@ -1,6 +1,6 @@
-"""Every flag of every data command with an invalid value.
+"""Every flag of every data command is given an invalid value.
 
-What a person must see is one line that names the flag, or the file that it names, and no output.
+The command must print one line that names the flag or its file, and write no output.
 """
 
 from collections.abc import Iterator
@@ -27,11 +27,11 @@ WORDS = {
     "render": ["synthetic_first_look", "out.mcap"],
     "record": ["out.mcap", "--robot", "cf1=udp://127.0.0.1:1"],
 }
-"""What else stands in the line; flight.mcap is there."""
+"""The other arguments of each command; only flight.mcap exists."""
 
 
-def wrong() -> Iterator[tuple[str, str, str]]:
-    """Commands, flags and what these cannot mean, by the type of the flag."""
+def iter_wrong_values() -> Iterator[tuple[str, str, str]]:
+    """Yield command, flag and a value that is invalid for the type of the flag."""
     for command in WORDS:
         for argument in cli.app[command].assemble_argument_collection():
             flag = next((name for name in argument.names if name.startswith("--")), None)
@@ -68,19 +68,20 @@ CONTRADICTIONS = [
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder with a short flight."""
     made = tmp_path_factory.mktemp("flags")
     fly.run(made / "flight.mcap", fly.Settings(2, 4.0, camera=True, camera_rate_hz=2))
     return made
 
 
-def _refused(
+def _run_refused(
     folder: Path,
     command: str,
     flags: list[str],
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> str:
-    """What a command says, in one line; nothing else happens."""
+    """Run a command that must fail without output; return its one-line error."""
     monkeypatch.chdir(folder)
     words = [command, *WORDS[command], *flags]
     try:
@@ -95,8 +96,8 @@ def _refused(
     return lines[0]
 
 
-@pytest.mark.parametrize(("command", "flag", "value"), [*wrong()])
-def test_a_value_that_a_flag_cannot_have_is_refused_by_name(
+@pytest.mark.parametrize(("command", "flag", "value"), [*iter_wrong_values()])
+def test_invalid_value_is_refused_with_the_name_of_its_flag(
     folder: Path,
     command: str,
     flag: str,
@@ -104,12 +105,12 @@ def test_a_value_that_a_flag_cannot_have_is_refused_by_name(
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    output = _refused(folder, command, [flag, value], capsys, monkeypatch)
+    output = _run_refused(folder, command, [flag, value], capsys, monkeypatch)
     assert flag.removesuffix("-s") in output or flag.strip("-").replace("-", "_") in output
 
 
 @pytest.mark.parametrize(("command", "named", "flags"), CONTRADICTIONS)
-def test_flags_that_contradict_are_refused_by_name(
+def test_contradicting_flags_are_refused_by_name(
     folder: Path,
     command: str,
     named: str,
@@ -117,4 +118,4 @@ def test_flags_that_contradict_are_refused_by_name(
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    assert named in _refused(folder, command, flags, capsys, monkeypatch)
+    assert named in _run_refused(folder, command, flags, capsys, monkeypatch)

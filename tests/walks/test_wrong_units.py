@@ -1,7 +1,4 @@
-"""Flights with columns in wrong units are doubted.
-
-What is said comes from ``dmrl convert`` or from ``dmrl check`` of what it wrote.
-"""
+"""Flights with columns in wrong units are reported by ``dmrl convert`` or ``dmrl check``."""
 
 from pathlib import Path
 
@@ -28,11 +25,11 @@ UNITS = {
     "time_ns": ("time_s", 1e9),
     "time_min": ("time_s", 1e-5),
 }
-"""Which columns begin so, and what they are multiplied by."""
+"""Start of the names of the wrong columns, and the factor that they are multiplied by."""
 
 
-def flight(folder: Path, column: str = "", factor: float = 1.0) -> Path:
-    """Two robots for 20 s; their columns agree with each other but for one."""
+def write_flight(folder: Path, column: str = "", factor: float = 1.0) -> Path:
+    """Write the CSV logs of two robots over 20 s, with some columns multiplied by a factor."""
     time_s = np.arange(0.0, 20.0, 0.02)
     noise = np.random.default_rng(1)
     paths = {
@@ -66,7 +63,7 @@ def flight(folder: Path, column: str = "", factor: float = 1.0) -> Path:
 
 
 def convert_and_read_stderr(source: Path, out: Path, capsys: pytest.CaptureFixture[str]) -> str:
-    """What convert and check say besides their tables."""
+    """Convert and check a flight; return the warnings of both commands."""
     words = [["convert", str(source), str(out)], ["check", str(out)]]
     status = [
         boundary.run_to_status(lambda w=w: app(w, result_action="return_value")) for w in words
@@ -78,7 +75,10 @@ def convert_and_read_stderr(source: Path, out: Path, capsys: pytest.CaptureFixtu
 
 
 def test_right_units_give_no_warning(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert convert_and_read_stderr(flight(tmp_path / "flight"), tmp_path / "out.mcap", capsys) == ""
+    assert (
+        convert_and_read_stderr(write_flight(tmp_path / "flight"), tmp_path / "out.mcap", capsys)
+        == ""
+    )
 
 
 @pytest.mark.parametrize("name", UNITS)
@@ -87,7 +87,7 @@ def test_wrong_unit_is_reported_with_its_column(
 ) -> None:
     column, factor = UNITS[name]
     text = convert_and_read_stderr(
-        flight(tmp_path / "flight", column, factor), tmp_path / "out.mcap", capsys
+        write_flight(tmp_path / "flight", column, factor), tmp_path / "out.mcap", capsys
     )
     asked = {"roll": "degrees", "pitch": "degrees", "yaw": "degrees per second", "time": "Were"}
     asked |= {"velocity": "mm/s or cm/s", "height": "mm or cm", "range": "left out"}

@@ -1,4 +1,7 @@
-"""Maps computed by a chip, beside the images: a level is 0.211 in logit and log depth."""
+"""Confidence and depth maps that a chip wrote beside its images.
+
+One level is 0.211 in the logit of the confidence and in the logarithm of the depth.
+"""
 
 from pathlib import Path
 
@@ -11,7 +14,8 @@ from dmrl.formats.aideck.chip_outputs import load_chip_maps
 from dmrl.images.codec import encode_png
 
 
-def pgm(path: Path, levels: np.ndarray) -> None:
+def write_pgm(path: Path, levels: np.ndarray) -> None:
+    """Write (rows, cols) signed levels as a PGM image, with 128 added."""
     rows, cols = levels.shape
     path.write_bytes(
         f"P5\n{cols} {rows}\n255\n".encode() + (levels + 128).astype(np.uint8).tobytes()
@@ -20,13 +24,14 @@ def pgm(path: Path, levels: np.ndarray) -> None:
 
 @pytest.fixture
 def frames(tmp_path: Path) -> Path:
+    """Return a folder of two images; only the second has maps."""
     folder = tmp_path / "frames"
     (folder / "gap8-maps").mkdir(parents=True)
     for number in ("00007", "00009"):
         (folder / f"img{number}.png").write_bytes(encode_png(np.zeros((24, 32, 3), np.uint8)))
     levels = np.arange(-6, 6).reshape(3, 4)
-    pgm(folder / "gap8-maps/pos00009.ppm", levels)
-    pgm(folder / "gap8-maps/dep00009.ppm", -levels)
+    write_pgm(folder / "gap8-maps/pos00009.ppm", levels)
+    write_pgm(folder / "gap8-maps/dep00009.ppm", -levels)
     return folder
 
 
@@ -41,7 +46,7 @@ def test_chip_maps_are_probabilities_and_metres_at_image_time(frames: Path, tmp_
 
 
 def test_incomplete_or_unequal_map_pairs_are_refused(frames: Path, tmp_path: Path) -> None:
-    pgm(frames / "gap8-maps/dep00009.ppm", np.zeros((2, 4), int))
+    write_pgm(frames / "gap8-maps/dep00009.ppm", np.zeros((2, 4), int))
     with pytest.raises(SourceError, match=r"dep00009\.ppm differs in size"):
         dmrl.convert(frames, tmp_path / "out.mcap")
     (frames / "gap8-maps/dep00009.ppm").unlink()

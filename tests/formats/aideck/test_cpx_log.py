@@ -1,4 +1,4 @@
-"""Packets in a stream of bytes: their boundaries in any noise."""
+"""Packets are found in a stream of bytes, also between noise."""
 
 import struct
 
@@ -42,7 +42,8 @@ def test_bytes_between_packets_are_counted_and_the_rest_at_the_end() -> None:
     assert not reader.finish()
 
 
-def app_packet(data: bytes) -> bytes:
+def pack_app_packet(data: bytes) -> bytes:
+    """Return a packet from the GAP8 to the host with the function for applications."""
     return pack_packet(Packet(GAP8, HOST, APP, data))
 
 
@@ -50,7 +51,7 @@ def app_packet(data: bytes) -> bytes:
     ("header", "broken"),
     [
         ((10, 10, 1, 0, 100), 0),
-        ((10, 10, 1, 2, 100), 1),  # no such encoding
+        ((10, 10, 1, 2, 100), 1),  # unknown encoding
         ((0, 10, 1, 0, 0), 1),
         ((10, 0, 1, 0, 0), 1),
         ((10, 10, 1, 1, 0), 1),
@@ -60,16 +61,17 @@ def app_packet(data: bytes) -> bytes:
 )
 def test_header_limits_are_checked(header: tuple[int, ...], broken: int) -> None:
     reader = ImageReader()
-    list(reader.feed(app_packet(cpx.HEADER.pack(cpx.MAGIC, *header))))
+    list(reader.feed(pack_app_packet(cpx.HEADER.pack(cpx.MAGIC, *header))))
     assert reader.broken == broken
 
 
-def plain_packets(data: bytes) -> tuple[list[bytes], int]:
-    """Packets of a whole stream and the bytes beside them, looked for byte by byte."""
+def find_packets_bytewise(data: bytes) -> tuple[list[bytes], int]:
+    """Search for packets byte by byte; return their payloads and the number of other bytes."""
 
     streamer = False
 
-    def size(at: int) -> int | None:
+    def read_size(at: int) -> int | None:
+        """Return the payload size of the header at a byte, -1 for none, None if it is cut."""
         if at + 4 > len(data):
             return None
         length, route, function = struct.unpack_from("<HBB", data, at)
@@ -83,9 +85,9 @@ def plain_packets(data: bytes) -> tuple[list[bytes], int]:
         return length - counted if known and counted <= length <= 4094 else -1
 
     found, at, skipped, in_step = [], 0, 0, True
-    while (here := size(at)) is not None:
+    while (here := read_size(at)) is not None:
         if here >= 0 and not in_step:
-            after = size(at + 4 + here)
+            after = read_size(at + 4 + here)
             if after is None:
                 break
             here = here if after >= 0 else -1
@@ -103,15 +105,15 @@ def plain_packets(data: bytes) -> tuple[list[bytes], int]:
 NOISE = st.sampled_from([b"", bytes(3), b"\0\0\x63\5", b"\2\0\x63", b"\6\0\x63\5\0", b"\x0b\1"])
 
 
-@example([(b"\2\0\x63", 4)], 1)  # noise and a length that together are a header
+@example([(b"\2\0\x63", 4)], 1)  # noise and a length that look like a header together
 @given(st.lists(st.tuples(NOISE, st.integers(0, 5)), max_size=9), st.integers(1, 9))
 @pytest.mark.heavy
 def test_packets_in_noise_equal_a_bytewise_search(
     parts: list[tuple[bytes, int]], step: int
 ) -> None:
-    data = b"".join(noise + app_packet(bytes(range(size))) for noise, size in parts)
+    data = b"".join(noise + pack_app_packet(bytes(range(size))) for noise, size in parts)
     reader = PacketReader()
     pieces = [data[k : k + step] for k in range(0, len(data), step)]
     got = [packet.data for piece in pieces for packet in reader.feed(piece)]
     reader.finish()
-    assert (got, reader.skipped_bytes) == plain_packets(data)
+    assert (got, reader.skipped_bytes) == find_packets_bytewise(data)

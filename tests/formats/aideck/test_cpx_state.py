@@ -34,7 +34,7 @@ def test_compressed_quaternions_are_bits_of_the_firmware_s() -> None:
     assert compress_quaternion((0.0, 0.0, -1.0, 0.0)) == (2 << 30 | 1 << 29 | 1 << 19 | 1 << 9) - (
         1 << 32
     )
-    # The largest part is positive, so the others change their signs with it.
+    # The largest component is stored as positive, so that all signs are flipped.
     near = compress_quaternion((-half - 1e-9, half, 0.0, 0.0))
     assert near == 1 << 29 | 511 << 20 | 1 << 19 | 1 << 9
     assert decompress_quaternion(1 << 29 | 511 << 20) == pytest.approx((half, -half, 0, 0))

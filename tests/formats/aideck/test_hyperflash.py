@@ -1,3 +1,5 @@
+"""HyperFlash dumps become images, logs and labels."""
+
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,8 +24,11 @@ VALUES = (
 )
 
 
-def known_pictures() -> list[Rgb]:
-    """Pictures that a Bayer filter loses nothing of: of one colour, and ramps."""
+def make_images() -> list[Rgb]:
+    """Return three images: one colour, ramps, and two colours side by side.
+
+    A Bayer filter keeps enough of each to restore the pixels that it samples.
+    """
     v, u = np.mgrid[:224, :320]
     plain = np.empty((224, 320, 3), np.uint8)
     plain[:] = (200, 30, 90)
@@ -34,24 +39,24 @@ def known_pictures() -> list[Rgb]:
 
 @pytest.fixture
 def dump(tmp_path: Path) -> Path:
-    """Three records and an end marker."""
+    """Return a dump of three records and an end marker."""
     path = tmp_path / "flash.bin"
-    path.write_bytes(foreign.flash_dump([to_bayer(p) for p in known_pictures()], VALUES))
+    path.write_bytes(foreign.pack_flash_dump([to_bayer(p) for p in make_images()], VALUES))
     return path
 
 
-def samples(path: Path, message: str, options: Options | None = None) -> list[Sample]:
-    """Samples of one message type, or of the log."""
+def read_samples(path: Path, message: str, options: Options | None = None) -> list[Sample]:
+    """Return the samples of a message type, or of the logged variables for ``log``."""
     found = hyperflash.load_content(path, options or Options()).samples
     return [s for s in found if (s.message if isinstance(s.message, str) else "log") == message]
 
 
 def test_images_are_decoded_exactly(dump: Path) -> None:
-    found = [decode(s.fields["data"]) for s in samples(dump, "CompressedImage")]
-    plain, ramp, halves = known_pictures()
+    found = [decode(s.fields["data"]) for s in read_samples(dump, "CompressedImage")]
+    plain, ramp, halves = make_images()
     assert len(found) == 3
     np.testing.assert_array_equal(found[0], plain)
-    # What a colour filter keeps comes back as it was, at every pixel of every picture.
+    # Each pixel keeps the colour that its filter let through.
     for got, known in zip(found, (plain, ramp, halves), strict=True):
         np.testing.assert_array_equal(to_bayer(got)[1:-1, 1:-1], to_bayer(known)[1:-1, 1:-1])
         np.testing.assert_array_equal(got, demosaic(to_bayer(known)))
@@ -60,18 +65,18 @@ def test_images_are_decoded_exactly(dump: Path) -> None:
 
 def test_numbers_are_decoded_exactly(dump: Path) -> None:
     wanted = np.array(VALUES, np.float32).astype(float)
-    logged = [list(s.fields.values()) for s in samples(dump, "log")]
+    logged = [list(s.fields.values()) for s in read_samples(dump, "log")]
     assert (np.array(logged) == wanted).all()
-    places = [[s.fields[axis] for axis in "xyz"] for s in samples(dump, "PeerPosition")]
+    places = [[s.fields[axis] for axis in "xyz"] for s in read_samples(dump, "PeerPosition")]
     assert (np.array(places) == wanted[:, 2:5]).all()
-    assert [s.fields["range_m"] for s in samples(dump, "UwbRange")] == wanted[:, 5].tolist()
-    attitude = samples(dump, "Attitude")[0].fields
+    assert [s.fields["range_m"] for s in read_samples(dump, "UwbRange")] == wanted[:, 5].tolist()
+    attitude = read_samples(dump, "Attitude")[0].fields
     assert attitude["roll_rad"] == pytest.approx(np.radians(1.5))
     assert attitude["pitch_rad"] == pytest.approx(np.radians(2.25))  # logged nose up
 
 
 def test_the_peer_is_labelled_where_the_firmware_had_it(dump: Path) -> None:
-    (peer,) = samples(dump, "PeerLabels", Options(names={"0": "cf5"}))[0].fields["peers"]
+    (peer,) = read_samples(dump, "PeerLabels", Options(names={"0": "cf5"}))[0].fields["peers"]
     assert (peer["peer"], peer["source"]) == ("cf5", "estimate")
     # 1.1 m ahead, 0.2 m left: left of the principal point at 166.9 px.
     assert peer["u_px"] == pytest.approx(166.9 - 183.73 * 0.2 / 1.1, abs=2)
@@ -79,13 +84,13 @@ def test_the_peer_is_labelled_where_the_firmware_had_it(dump: Path) -> None:
 
 
 def test_times_follow_the_nominal_rate(dump: Path) -> None:
-    times = [s.time_ns for s in samples(dump, "CompressedImage", Options(rate_hz=4))]
+    times = [s.time_ns for s in read_samples(dump, "CompressedImage", Options(rate_hz=4))]
     assert times == [0, 250_000_000, 500_000_000]
 
 
 def test_reading_stops_at_the_end_marker(dump: Path) -> None:
     dump.write_bytes(dump.read_bytes() + dump.read_bytes())
-    assert len(samples(dump, "CompressedImage")) == 3
+    assert len(read_samples(dump, "CompressedImage")) == 3
 
 
 @pytest.mark.parametrize("length", [1, 71_679, 71_680, 71_703])
@@ -93,7 +98,7 @@ def test_truncated_record_is_omitted_and_reported(
     dump: Path, length: int, capsys: pytest.CaptureFixture[str]
 ) -> None:
     dump.write_bytes(dump.read_bytes()[: 2 * 71_704 + length])
-    assert len(samples(dump, "CompressedImage")) == 2
+    assert len(read_samples(dump, "CompressedImage")) == 2
     said = f"left out: records that are cut short: 1 (at {dump}: its last {length} bytes)"
     assert said in capsys.readouterr().err
 
@@ -102,16 +107,16 @@ def test_a_dump_without_end_marker_ends_with_the_file(
     dump: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     dump.write_bytes(dump.read_bytes()[: 3 * 71_704])
-    assert len(samples(dump, "CompressedImage")) == 3
+    assert len(read_samples(dump, "CompressedImage")) == 3
     assert capsys.readouterr().err == ""
 
 
 def test_impossible_numbers_make_no_label(dump: Path, capsys: pytest.CaptureFixture[str]) -> None:
     values = ((float("nan"), 0, 1, 0, 0, 1), *VALUES[1:])
-    dump.write_bytes(foreign.flash_dump([to_bayer(p) for p in known_pictures()], values))
-    assert len(samples(dump, "CompressedImage")) == 3
+    dump.write_bytes(foreign.pack_flash_dump([to_bayer(p) for p in make_images()], values))
+    assert len(read_samples(dump, "CompressedImage")) == 3
     assert "left out: labels of records with impossible numbers: 1" in capsys.readouterr().err
-    assert len(samples(dump, "PeerLabels")) == 2
+    assert len(read_samples(dump, "PeerLabels")) == 2
 
 
 def test_an_erased_flash_holds_no_record(tmp_path: Path) -> None:
@@ -146,9 +151,9 @@ def test_real_frames_are_behind_the_filters_that_are_assumed(data: Path) -> None
 @pytest.mark.parametrize(("odd", "of", "taken"), [(1, 3, True), (1, 2, False), (2, 3, False)])
 def test_most_records_of_a_dump_are_plausible(odd: int, of: int, taken: bool, dump: Path) -> None:
     values = [*[(1e9,) * 6] * odd, *[VALUES[0]] * (of - odd)]
-    dump.write_bytes(foreign.flash_dump([to_bayer(p) for p in known_pictures()[:of]], values))
+    dump.write_bytes(foreign.pack_flash_dump([to_bayer(p) for p in make_images()[:of]], values))
     if taken:
-        assert len(samples(dump, "CompressedImage")) == of
+        assert len(read_samples(dump, "CompressedImage")) == of
     else:
         with pytest.raises(SourceError, match=f"{odd} of {of} records have impossible"):
             hyperflash.load_content(dump, Options())
@@ -175,4 +180,4 @@ def test_the_camera_comes_first_and_peers_are_named(dump: Path) -> None:
     camera = replace(AIDECK, cx_px=99.5)
     first, *_ = hyperflash.load_content(dump, Options(camera=camera)).samples
     assert first.fields["K"][2] == 99.5
-    assert hyperflash.load_content(dump, Options()).total == 4  # records, and the erased one
+    assert hyperflash.load_content(dump, Options()).total == 4  # three records, and the erased one

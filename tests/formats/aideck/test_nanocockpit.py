@@ -1,3 +1,5 @@
+"""Folders of the nanocockpit client become images and states with unwrapped times."""
+
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,34 +17,32 @@ from dmrl.samples.sample import Sample
 from dmrl.terminal.left_out import count_left_out
 
 from .. import foreign
+from ..reading import group_by_topic
 
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """Six pictures; time and number wrap between the third and the fourth."""
-    return foreign.nanocockpit(tmp_path / "cockpit")
+    """Return a folder of six images; time and number wrap between the third and the fourth."""
+    return foreign.write_nanocockpit(tmp_path / "cockpit")
 
 
-def samples(folder: Path) -> dict[str, list[Sample]]:
-    """Samples by topic."""
-    found: dict[str, list[Sample]] = {}
-    for sample in nanocockpit.load_content(folder, Options()).samples:
-        found.setdefault(sample.topic, []).append(sample)
-    return found
+def read_samples(folder: Path) -> dict[str, list[Sample]]:
+    """Return the samples of a folder by topic."""
+    return group_by_topic(nanocockpit.load_content(folder, Options()).samples)
 
 
 def test_pictures_have_the_camera_s_time_unwrapped(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    found = samples(folder)["/cf1/camera/image"]
+    found = read_samples(folder)["/cf1/camera/image"]
     assert np.diff([s.time_ns for s in found]).tolist() == [50_000_000] * 5
-    for sample, raw in zip(found, foreign.pictures(6), strict=True):
+    for sample, raw in zip(found, foreign.make_raw_images(6), strict=True):
         np.testing.assert_array_equal(decode(sample.fields["data"]), demosaic(raw))
     assert capsys.readouterr().err == ""
 
 
 def test_the_state_has_the_units_of_dmrl(folder: Path) -> None:
-    found = samples(folder)
+    found = read_samples(folder)
     attitude, velocity = found["/cf1/attitude"], found["/cf1/velocity"]
     assert attitude[0].fields == pytest.approx(
         {"roll_rad": 0, "pitch_rad": 0, "yaw_rad": 0, "yaw_rate_radps": 0.25}, abs=2e-3
@@ -50,7 +50,7 @@ def test_the_state_has_the_units_of_dmrl(folder: Path) -> None:
     assert velocity[0].fields == pytest.approx({"vx_mps": 0.5, "vy_mps": 0, "vz_mps": 0}, abs=1e-9)
     assert [s.fields["height_m"] for s in found["/cf1/height"]] == pytest.approx([0.9] * 6)
     assert found["/cf1/pose"][5].fields["pose"]["position"]["x"] == pytest.approx(0.5)
-    # The state came 5 ms before the picture.
+    # The state was received 5 ms before the image was taken.
     assert found["/cf1/camera/image"][0].time_ns - attitude[0].time_ns == 5_000_000
 
 
@@ -60,7 +60,7 @@ def test_lost_pictures_are_counted_by_their_numbers(
     lines = (folder / "metadata.csv").read_text().splitlines()
     del lines[3:5]
     (folder / "metadata.csv").write_text("\n".join(lines) + "\n")
-    assert len(samples(folder)["/cf1/camera/image"]) == 4
+    assert len(read_samples(folder)["/cf1/camera/image"]) == 4
     assert "2 images were lost in transmission" in capsys.readouterr().err
 
 
@@ -68,7 +68,7 @@ def test_table_that_does_not_fit_gives_one_line_error(folder: Path) -> None:
     path = folder / "metadata.csv"
     path.write_text(path.read_text().replace("frame_id", "frame"))
     with pytest.raises(SourceError, match=r"metadata\.csv:1: no column frame_id"):
-        samples(folder)
+        read_samples(folder)
 
 
 def test_a_row_of_other_numbers_is_left_out_with_its_line(folder: Path) -> None:
@@ -76,7 +76,7 @@ def test_a_row_of_other_numbers_is_left_out_with_its_line(folder: Path) -> None:
     assert ",10,255," in path.read_text()
     path.write_text(path.read_text().replace(",10,255,", ",10,x,"))
     with count_left_out() as counted:
-        assert len(samples(folder)["/cf1/camera/image"]) == 5
+        assert len(read_samples(folder)["/cf1/camera/image"]) == 5
     assert counted.first == {"lines with numbers that are not whole": f"{path}:4"}
 
 
@@ -84,7 +84,7 @@ def test_a_row_without_its_picture_is_left_out(folder: Path) -> None:
     path = folder / "metadata.csv"
     path.write_text(path.read_text().replace("00003.jpg", "00009.jpg"))
     with count_left_out() as counted:
-        assert len(samples(folder)["/cf1/camera/image"]) == 5
+        assert len(read_samples(folder)["/cf1/camera/image"]) == 5
     assert counted.counts == {"rows without their picture": 1}
 
 
@@ -92,7 +92,7 @@ def test_nanocockpit_folder_is_recognized_by_its_table(folder: Path) -> None:
     assert find_format(folder).name == "nanocockpit"
 
 
-def test_differences_of_counts_that_wrap_are_the_short_way() -> None:
+def test_counter_differences_wrap_to_signed_32_bits() -> None:
     ticks = np.array([5, -5, 2**31 - 1, 2**31, -(2**31), 2**32 - 3, 3 - 2**32])
     short = [5, -5, 2**31 - 1, -(2**31), -(2**31), -3, 3]
     assert nanocockpit._wrap_to_int32(ticks).tolist() == short
@@ -102,11 +102,11 @@ def test_a_state_from_before_the_wrap_has_a_time_before_the_first_picture(folder
     path = folder / "metadata.csv"
     head, *rows = path.read_text().splitlines()
     cells = [row.split(",") for row in rows]
-    for number in (3, 4):  # the picture's time and the state's
+    for number in (3, 4):  # columns of the times of image and state
         for k, row in enumerate(cells):
             row[number] = str((2_000 + 50_000 * k - (number == 4) * 5_000) % 2**32)
     path.write_text("\n".join([head, *map(",".join, cells)]) + "\n")
-    found = samples(folder)
+    found = read_samples(folder)
     images, states = found["/cf1/camera/image"], found["/cf1/attitude"]
     assert min(sample.time_ns for sample in states) >= 0
     assert {i.time_ns - s.time_ns for i, s in zip(images, states, strict=True)} == {5_000_000}
@@ -120,19 +120,19 @@ def test_repeated_state_is_written_once(folder: Path) -> None:
     for row, stamp in zip(rows, ("0", "0", rows[2][at], rows[2][at], *"xx"), strict=True):
         row[at] = row[at] if stamp == "x" else stamp
     path.write_text("\n".join([head, *(",".join(row) for row in rows)]) + "\n")
-    found = samples(folder)
+    found = read_samples(folder)
     images = [s.time_ns for s in found["/cf1/camera/image"]]
     assert [s.time_ns for s in found["/cf1/attitude"]] == [images[k] - 5_000_000 for k in (2, 4, 5)]
     for row in rows:
         row[at] = "0"
     path.write_text("\n".join([head, *(",".join(row) for row in rows)]) + "\n")
-    assert samples(folder).keys() == {"/cf1/camera/image"}
+    assert read_samples(folder).keys() == {"/cf1/camera/image"}
 
 
 def test_given_calibration_is_written_before_the_images(folder: Path) -> None:
     camera = replace(AIDECK, width_px=32, height_px=24)
     first, *rest = nanocockpit.load_content(folder, Options(robot="me", camera=camera)).samples
-    while first.topic != "/me/camera/calibration":  # a state may have come before
+    while first.topic != "/me/camera/calibration":  # states may precede the calibration
         first, *rest = rest
     images = [s.time_ns for s in rest if s.topic == "/me/camera/image"]
     assert first.time_ns == images[0] == (2**32 - 120_000) * 1000
@@ -146,7 +146,7 @@ def test_colour_pictures_stand_in_for_raw_ones_as_they_are(folder: Path) -> None
         path.unlink()
         jpegs.append(encode_jpeg(np.full((24, 32, 3), 20 * k, np.uint8)))
         path.with_suffix(".jpg").write_bytes(jpegs[-1])
-    found = samples(folder)["/cf1/camera/image"]
+    found = read_samples(folder)["/cf1/camera/image"]
     assert [s.fields["data"] for s in found] == jpegs
     assert {s.fields["format"] for s in found} == {"jpeg"}
     assert nanocockpit.can_read(folder)
@@ -159,10 +159,10 @@ def test_raw_pictures_are_of_four_by_four_pixels_at_least(
     for path in (folder / "camera_raw").iterdir():
         path.write_bytes(encode_png(np.zeros(size, np.uint8)))
     if fits:
-        assert len(samples(folder)["/cf1/camera/image"]) == 6
+        assert len(read_samples(folder)["/cf1/camera/image"]) == 6
     else:
         with count_left_out() as counted:
-            assert "/cf1/camera/image" not in samples(folder)
+            assert "/cf1/camera/image" not in read_samples(folder)
         assert counted.counts == {"images that cannot be decoded": 6}
 
 
@@ -188,10 +188,10 @@ def test_a_table_s_last_line_may_be_cut(
     path.write_text(text.format(head=head, row=row, large=large))
     if said:
         with pytest.raises(SourceError, match=said.replace(".", r"\.")):
-            samples(folder)
+            read_samples(folder)
         return
     cut = "a,1" in text
-    assert len(samples(folder)["/cf1/camera/image"]) == text.count("{row}")
+    assert len(read_samples(folder)["/cf1/camera/image"]) == text.count("{row}")
     assert (
         "left out: lines with fewer or more cells than the header: 1" in capsys.readouterr().err
     ) == cut
@@ -205,8 +205,8 @@ def test_every_number_of_a_state_is_in_its_place(folder: Path) -> None:
     for name, value in values.items():
         cells[names.index(f"state_{name}")] = str(value)
     path.write_text(f"{head}\n{','.join(cells)}\n")
-    found = samples(folder)
-    velocity = found["/cf1/velocity"][0].fields  # it looks along x
+    found = read_samples(folder)
+    velocity = found["/cf1/velocity"][0].fields  # the robot faces along x
     assert velocity == pytest.approx({"vx_mps": 0.4, "vy_mps": -0.5, "vz_mps": 0.6})
     place = found["/cf1/pose"][0].fields["pose"]["position"]
     assert place == pytest.approx({"x": 1, "y": -2, "z": 3})

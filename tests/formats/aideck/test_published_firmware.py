@@ -1,4 +1,4 @@
-"""The six numbers of the published firmware."""
+"""The six numbers that the published firmware stores with each image."""
 
 import numpy as np
 import pytest
@@ -47,28 +47,31 @@ def test_peer_out_of_view_has_no_label() -> None:
 
 
 def test_a_label_ends_at_the_picture_s_edges() -> None:
-    """Of a camera without distortion that stands level: u = cx - f y / x, v = cy - f z / x."""
+    """A label needs its centre inside the image and a depth over 5 cm.
+
+    A level camera without distortion sees u = cx - fx y / x and v = cy - fy z / x.
+    """
     camera = Camera(100, 80, 40.0, 50.0, 50.0, 40.0, ())
 
-    def seen(x: float, u: float, v: float) -> list[dict[str, float]]:
+    def label(x: float, u: float, v: float) -> list[dict[str, float]]:
         place = (x, (50.0 - u) * x / 40.0, (40.0 - v) * x / 50.0)
         *_, labels = iter_samples(7, "cf1", "cf2", (0.0, 0.0, *place, 0.0), camera)
         found: list[dict[str, float]] = labels.fields["peers"]
         return found
 
-    ((first),) = seen(2.0, 10.0, 20.0)
+    ((first),) = label(2.0, 10.0, 20.0)
     assert (first["u_px"], first["v_px"], first["depth_m"]) == pytest.approx((10, 20, 2))
     for u, v, count in (
         *((0.01, 40, 1), (-0.01, 40, 0), (99.99, 40, 1), (100.01, 40, 0)),
         *((50, 0.01, 1), (50, -0.01, 0), (50, 79.99, 1), (50, 80.01, 0)),
     ):
-        assert len(seen(2.0, u, v)) == count
-    assert len(seen(0.051, 50, 40)) == 1
-    assert len(seen(0.049, 50, 40)) == 0
+        assert len(label(2.0, u, v)) == count
+    assert len(label(0.051, 50, 40)) == 1
+    assert len(label(0.049, 50, 40)) == 0
 
 
 def test_left_and_top_image_edges_are_inside() -> None:
-    """In numbers that floats hold exactly."""
+    """All numbers are exact in floating point, so that the edges are hit exactly."""
     camera = Camera(128, 64, 32.0, 32.0, 64.0, 32.0, ())
     for u, v, count in ((0, 0, 1), (128, 32, 0), (64, 64, 0), (127, 63, 1)):
         place = (1.0, (64 - u) / 32, (32 - v) / 32)

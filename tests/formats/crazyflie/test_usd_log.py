@@ -1,3 +1,5 @@
+"""The decoder of micro-SD logs equals a simple one, also for damaged logs."""
+
 import struct
 import zlib
 from pathlib import Path
@@ -12,7 +14,7 @@ from dmrl.formats.crazyflie import usd_log
 from .. import foreign, plain_usd
 
 LOGS = ("log05", "jana00_brushed_flights", "eckart00_brushless_flights")
-# Records of each event, counted by an independent decoder.
+# Number of records of each event, counted by an independent decoder.
 COUNTS = {
     "log05": {
         "estTDOA": 2044,
@@ -26,8 +28,8 @@ COUNTS = {
 }
 
 
-def same(log: usd_log.UsdLog, data: bytes) -> None:
-    """The log holds what the value-by-value decoder finds, bit for bit."""
+def assert_equal_to_reference(log: usd_log.UsdLog, data: bytes) -> None:
+    """Assert that a log equals the result of the value-by-value decoder, bit for bit."""
     wanted = plain_usd.decode(data)
     unit = {1: 1_000_000, 2: 1000}[log.version]
     assert [b.name for b in log.blocks] == [name for name, v in wanted.items() if v["timestamp"]]
@@ -46,7 +48,7 @@ def test_real_logs_equal_an_independent_decode(data: Path, name: str) -> None:
     log = usd_log.decode_log(raw)
     assert log.warnings == ()
     assert {b.name: len(b.time_ns) for b in log.blocks} == COUNTS[name]
-    same(log, raw)
+    assert_equal_to_reference(log, raw)
 
 
 def test_rates_of_a_real_log_match_its_settings(data: Path) -> None:
@@ -61,10 +63,10 @@ def test_rates_of_a_real_log_match_its_settings(data: Path) -> None:
 
 @pytest.mark.parametrize("version", [1, 2])
 def test_both_log_versions_are_read(version: int) -> None:
-    raw = foreign.usd_log(version)
+    raw = foreign.pack_usd_log(version)
     log = usd_log.decode_log(raw)
     assert (log.version, log.warnings) == (version, ())
-    same(log, raw)
+    assert_equal_to_reference(log, raw)
 
 
 def test_events_on_either_side_of_a_wrap_stay_together() -> None:
@@ -95,7 +97,7 @@ def test_a_log_cut_anywhere_gives_every_whole_record_and_a_warning(
     name: str, request: pytest.FixtureRequest
 ) -> None:
     if name == "synthetic":
-        raw = foreign.usd_log()
+        raw = foreign.pack_usd_log()
     else:
         raw = (request.getfixturevalue("data") / "crazyflie-usd" / name).read_bytes()
     body = usd_log._parse_header(raw, name)[2]
@@ -108,7 +110,7 @@ def test_a_log_cut_anywhere_gives_every_whole_record_and_a_warning(
         log = usd_log.decode_log(raw[:length], name)
         assert "no valid CRC" in log.warnings[0]
         got = sum(len(b.time_ns) * sizes[b.name] for b in log.blocks)
-        # What is left is less than one record.
+        # The bytes that are not decoded are less than one record.
         assert 0 <= length - body - got < size.max()
         for cut in log.blocks:
             full = next(b for b in whole.blocks if b.name == cut.name)
@@ -135,13 +137,13 @@ def test_empty_log_gives_one_line_error(tmp_path: Path) -> None:
 )
 def test_damaged_header_gives_one_line_error(damage: object, text: str) -> None:
     with pytest.raises(SourceError, match=text):
-        usd_log.decode_log(damage(foreign.usd_log()), "log07")  # type: ignore[operator]
+        usd_log.decode_log(damage(foreign.pack_usd_log()), "log07")  # type: ignore[operator]
 
 
 def test_an_id_that_is_unknown_ends_the_log_with_a_warning(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    raw = foreign.usd_log()
+    raw = foreign.pack_usd_log()
     log = usd_log.decode_log(raw[:-4] + b"\x55\x55" + b"\0" * 30)
     assert [len(b.time_ns) for b in log.blocks] == [100, 20, 20]
     assert "left out: bytes that are no whole record: 32" in capsys.readouterr().err
@@ -151,7 +153,7 @@ def test_bytes_that_look_like_ids_are_no_records() -> None:
     events = {7: ("a", [("x", "H"), ("y", "H")]), 9: ("b", [("z", "I")])}
     rows = [(7, 7 * 65536 + 9, (7, 9)) if k % 3 else (9, 7, (9 * 65536 + 7,)) for k in range(300)]
     raw = plain_usd.encode(events, rows)
-    same(usd_log.decode_log(raw), raw)
+    assert_equal_to_reference(usd_log.decode_log(raw), raw)
 
 
 @pytest.mark.parametrize("code", ["H", "B"])
@@ -172,7 +174,7 @@ def test_interleaved_events_are_decoded(pattern: str, code: str) -> None:
     events = {ord(c) - 90: (c, [("x", "H"), ("y", code)]) for c in "abc"}
     rows = [(ord(c) - 90, 1000 * k, (k, 7)) for k, c in enumerate(pattern)]
     raw = plain_usd.encode(events, rows)
-    same(usd_log.decode_log(raw), raw)
+    assert_equal_to_reference(usd_log.decode_log(raw), raw)
 
 
 def test_milliseconds_that_wrap_go_on() -> None:
@@ -232,7 +234,7 @@ def test_events_with_equal_low_id_bytes_are_decoded(numbers: tuple[int, int]) ->
         (numbers[k % 3 == 0], 1000 * k, (k,) if k % 3 else (70_000 + k, 257)) for k in range(200)
     ]
     raw = plain_usd.encode(events, rows)
-    same(usd_log.decode_log(raw), raw)
+    assert_equal_to_reference(usd_log.decode_log(raw), raw)
 
 
 def test_a_log_has_250_types_of_events_at_most_and_names_that_print() -> None:

@@ -1,4 +1,4 @@
-"""Records of several kinds, against sequential parsing."""
+"""The vectorised search for log records equals sequential parsing."""
 
 import numpy as np
 import pytest
@@ -15,10 +15,10 @@ NUMBERS = st.lists(
 )
 
 
-def plain(
+def parse_sequentially(
     data: bytes, body: int, end: int, events: list[EventType]
 ) -> tuple[dict[str, bytes], int]:
-    """Bytes of the records of each event, and where the last whole one ends."""
+    """Return the bytes of the records of each event, and the end of the last whole record."""
     sizes = {event.number: event.dtype.itemsize for event in events}
     names = {event.number: event.name for event in events}
     found, at = {event.name: b"" for event in events}, body
@@ -62,14 +62,14 @@ def test_records_equal_sequential_parsing(
     rng = np.random.default_rng(seed)
     data = b"head" + b"".join(
         event.number.to_bytes(2, "little")
-        # What stands in a record may look like the number of one.
+        # The content of a record may look like the number of an event.
         + rng.choice([0, 1, 2, 255], event.dtype.itemsize - 2).astype(np.uint8).tobytes()
         for event in order
     )
     cut = data + rest + b"tail"
     for end in (len(data), len(data) - 1, len(data) + len(rest)):
         rows, stop = gather_records(cut, 4, end, events)
-        wanted, wanted_stop = plain(cut, 4, end, events)
+        wanted, wanted_stop = parse_sequentially(cut, 4, end, events)
         assert stop == wanted_stop
         assert {name: row.tobytes() for name, row in rows.items()} == wanted
 

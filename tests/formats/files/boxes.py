@@ -1,4 +1,4 @@
-"""Images with boxes, and the labels expected of them."""
+"""Small sets of labelled images, and the labels that are expected of them."""
 
 from pathlib import Path
 from typing import Any
@@ -14,8 +14,8 @@ WIDTH, HEIGHT = 320, 224
 Boxes = list[tuple[str, tuple[float, float, float, float]]]
 
 
-def boxes_of(k: int) -> Boxes:
-    """Boxes of picture k with their classes: none in every third picture."""
+def make_boxes(k: int) -> Boxes:
+    """Return class and edges, pixels, of the k % 3 boxes of image k."""
     rng = np.random.default_rng(k)
     found = []
     for n in range(k % 3):
@@ -26,11 +26,13 @@ def boxes_of(k: int) -> Boxes:
 
 
 def write_picture(path: Path, k: int) -> None:
+    """Write image k, all of whose pixels are k."""
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(encode_png(np.full((HEIGHT, WIDTH, 3), k, np.uint8)))
 
 
-def yolo_lines(boxes: Boxes) -> str:
+def format_yolo(boxes: Boxes) -> str:
+    """Return the lines of a YOLO label file."""
     numbers = {"drone": 0, "quad copter": 1}
     return "".join(
         f"{numbers[name]} {(a + c) / 2 / WIDTH:.6f} {(b + d) / 2 / HEIGHT:.6f} "
@@ -39,22 +41,24 @@ def yolo_lines(boxes: Boxes) -> str:
     )
 
 
-def read(source: Path, kind: str, options: Options | None = None) -> list[Sample]:
+def read_samples(source: Path, kind: str, options: Options | None = None) -> list[Sample]:
+    """Return the samples of a source, whose format must be recognized as ``kind``."""
     form = find_format(source)
     assert form.name == kind
     return list(form.content(source, options or Options()).samples)
 
 
-def labels_of(samples: list[Sample]) -> list[list[dict[str, Any]]]:
+def find_labels(samples: list[Sample]) -> list[list[dict[str, Any]]]:
+    """Return the labels of each labelled image."""
     return [list(s.fields["peers"]) for s in samples if s.message == "PeerLabels"]
 
 
-def check(samples: list[Sample], order: list[int], apart_px: float = 0.01) -> None:
-    """Assert that the samples hold the boxes of these pictures, in this order."""
-    found = labels_of(samples)
+def assert_boxes(samples: list[Sample], order: list[int], apart_px: float = 0.01) -> None:
+    """Assert that the samples hold the boxes of these images, in this order."""
+    found = find_labels(samples)
     assert len(found) == len(order)
     for peers, k in zip(found, order, strict=True):
-        want = boxes_of(k)
+        want = make_boxes(k)
         names = [name.replace(" ", "_") for name, _ in want]
         assert [peer["peer"] for peer in peers] == names
         for peer, (_, box) in zip(peers, want, strict=True):

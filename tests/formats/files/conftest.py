@@ -1,4 +1,4 @@
-"""Fixtures of the tests of files."""
+"""Small folders of images."""
 
 from pathlib import Path
 
@@ -7,23 +7,23 @@ import pytest
 
 from dmrl.images.codec import encode_jpeg, encode_png
 
-from .boxes import boxes_of, write_picture, yolo_lines
+from .boxes import format_yolo, make_boxes, write_picture
 
 
 @pytest.fixture
-def small(tmp_path: Path) -> Path:
-    """Two labelled pictures of a YOLO set."""
+def yolo_set(tmp_path: Path) -> Path:
+    """Return a YOLO set of two labelled images."""
     for k in (1, 2):
         write_picture(tmp_path / "images" / f"{k}.png", k)
         (tmp_path / "labels").mkdir(exist_ok=True)
-        (tmp_path / "labels" / f"{k}.txt").write_text(yolo_lines(boxes_of(k)))
+        (tmp_path / "labels" / f"{k}.txt").write_text(format_yolo(make_boxes(k)))
     (tmp_path / "classes.txt").write_text("drone\nquad copter\n")
     return tmp_path
 
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """Three pictures of 64 x 48: PNG, JPEG and PPM."""
+    """Return a folder of three images of 64 x 48 pixels, as PNG, JPEG and PPM, and a text file."""
     path = tmp_path / "pictures"
     path.mkdir()
     rgb = np.random.default_rng(0).integers(0, 256, (48, 64, 3), np.uint8)

@@ -1,4 +1,4 @@
-"""Column maps of CSV files: their units, and their faults."""
+"""Column maps of CSV files: units and errors."""
 
 from pathlib import Path
 from textwrap import dedent

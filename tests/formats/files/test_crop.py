@@ -38,14 +38,14 @@ def test_a_label_goes_where_the_camera_of_the_result_sees_it(crop: Crop) -> None
 def test_boxes_are_clipped_and_dropped_outside_the_image() -> None:
     left, _ = WIDE.corner_px
 
-    def box(*box_px: float) -> tuple[float, ...]:
+    def crop_box(*box_px: float) -> tuple[float, ...]:
         return WIDE.crop_label(LabelRow("a.png", "cf2", box_px=box_px)).box_px
 
-    assert box(left + 100, 50, left + 200, 100) == pytest.approx((48, 24, 96, 48))
-    assert box(0, -50, 2000, 600) == pytest.approx((0, 0, 320, 240))
-    assert box(0, 50, left, 100) == ()
-    assert box(left + 100, 500, left + 200, 550) == ()
-    assert box() == ()
+    assert crop_box(left + 100, 50, left + 200, 100) == pytest.approx((48, 24, 96, 48))
+    assert crop_box(0, -50, 2000, 600) == pytest.approx((0, 0, 320, 240))
+    assert crop_box(0, 50, left, 100) == ()
+    assert crop_box(left + 100, 500, left + 200, 550) == ()
+    assert crop_box() == ()
 
 
 @pytest.mark.parametrize("crop", [WIDE, HIGH])

@@ -1,4 +1,4 @@
-"""Headers of text tables, as well-known sets of flights have them."""
+"""Headers of text tables, as in well-known sets of flights."""
 
 from pathlib import Path
 

@@ -1,3 +1,5 @@
+"""Folders of images and labels become samples."""
+
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -18,14 +20,14 @@ from dmrl.terminal.left_out import count_left_out
 HEADER = "file,peer,u_px,v_px,depth_m\n"
 
 
-def samples(folder: Path, kind: str, options: Options | None = None) -> list[Sample]:
-    """Samples of one message type."""
+def read_samples(folder: Path, kind: str, options: Options | None = None) -> list[Sample]:
+    """Return the samples of one message type."""
     found = image_folder.load_content(folder, options or Options()).samples
     return [sample for sample in found if sample.message == kind]
 
 
 def test_png_and_jpeg_keep_their_bytes_and_others_their_pixels(folder: Path) -> None:
-    png, jpeg, ppm = samples(folder, "CompressedImage")
+    png, jpeg, ppm = read_samples(folder, "CompressedImage")
     assert png.fields["data"] == (folder / "a.png").read_bytes()
     assert (jpeg.fields["format"], jpeg.fields["data"]) == (
         "jpeg",
@@ -36,7 +38,7 @@ def test_png_and_jpeg_keep_their_bytes_and_others_their_pixels(folder: Path) -> 
 
 
 def test_names_that_are_no_times_get_a_nominal_rate(folder: Path) -> None:
-    times = [s.time_ns for s in samples(folder, "CompressedImage", Options(rate_hz=30))]
+    times = [s.time_ns for s in read_samples(folder, "CompressedImage", Options(rate_hz=30))]
     assert times == [0, 33_333_333, 66_666_667]
 
 
@@ -44,7 +46,7 @@ def test_names_of_twelve_digits_are_times(folder: Path) -> None:
     times = (1_700_000_000_000_000_000, 1_600_000_000_000_000_000, 999_999_999_999)
     for path, time_ns in zip(sorted(folder.glob("[abc].*")), times, strict=True):
         path.rename(folder / f"{time_ns}{path.suffix}")
-    assert [s.time_ns for s in samples(folder, "CompressedImage")] == sorted(times)
+    assert [s.time_ns for s in read_samples(folder, "CompressedImage")] == sorted(times)
 
 
 def test_unlabelled_empty_and_labelled_images_differ(folder: Path) -> None:
@@ -77,7 +79,7 @@ def test_unlabelled_empty_and_labelled_images_differ(folder: Path) -> None:
 
 
 def test_labels_boxes_and_camera_follow_the_crop(folder: Path) -> None:
-    # From 64 x 48 to 40 x 40: the middle 48 x 48, from column 8, scaled by 40/48.
+    # The crop keeps the middle 48 x 48 pixels of 64 x 48, from column 8, and scales them by 40/48.
     (folder / "labels.csv").write_text(
         "file,peer,u_px,v_px,depth_m,left_px,top_px,right_px,bottom_px,sigma_u_px,sigma_depth_m\n"
         "a.png,cf2,32,12,0.8,4,6,20,18,6,0.3\n"
@@ -85,15 +87,15 @@ def test_labels_boxes_and_camera_follow_the_crop(folder: Path) -> None:
     )
     camera = replace(AIDECK, width_px=64, height_px=48, cx_px=30.0, cy_px=20.0)
     options = Options(camera=camera, size_px=(40, 40))
-    one, other = (s.fields["peers"][0] for s in samples(folder, "PeerLabels", options))
+    one, other = (s.fields["peers"][0] for s in read_samples(folder, "PeerLabels", options))
     assert (one["u_px"], one["v_px"], one["sigma_u_px"]) == pytest.approx((20, 10, 5))
     assert (one["depth_m"], one["sigma_depth_m"]) == (0.8, 0.3)
     assert one["box_px"] == pytest.approx([0, 5, 10, 15])
     assert other["u_px"] < 0 and other["box_px"] == []
     assert {
-        decode(s.fields["data"]).shape for s in samples(folder, "CompressedImage", options)
+        decode(s.fields["data"]).shape for s in read_samples(folder, "CompressedImage", options)
     } == {(40, 40, 3)}
-    (calibration,) = samples(folder, "CameraCalibration", options)
+    (calibration,) = read_samples(folder, "CameraCalibration", options)
     point = np.array([[2.0, 0.1, 0.2]])
     before, _ = project(point, camera.image_from_optical)
     after, _ = project(point, np.reshape(calibration.fields["K"], (3, 3)))
@@ -108,45 +110,58 @@ def test_crop_and_labels_agree(tmp_path: Path) -> None:
     (tmp_path / "a.png").write_bytes(encode_png(rgb))
     (tmp_path / "labels.csv").write_text(HEADER + "a.png,cf2,365,110,1\n")
     options = Options(size_px=(320, 224))
-    (label,) = samples(tmp_path, "PeerLabels", options)
-    (picture,) = samples(tmp_path, "CompressedImage", options)
+    (label,) = read_samples(tmp_path, "PeerLabels", options)
+    (picture,) = read_samples(tmp_path, "CompressedImage", options)
     bright = np.argwhere(decode(picture.fields["data"])[..., 0] > 127)
     v_px, u_px = (bright.min(0) + bright.max(0) + 1) / 2
     peer = label.fields["peers"][0]
     assert (peer["u_px"], peer["v_px"]) == pytest.approx((u_px, v_px), abs=0.6)
 
 
-def _write(text: str) -> Callable[[Path], None]:
+def _write_labels(text: str) -> Callable[[Path], None]:
+    """Return a function that writes a text to labels.csv of a folder."""
     return lambda folder: (folder / "labels.csv").write_text(text) and None
 
 
 @pytest.mark.parametrize(
     ("spoil", "message"),
     [
-        (_write(HEADER + "a.pgn,cf2,1,2,3\n"), r"labels\.csv:2: .*'a\.pgn' .*mean a\.png\?"),
-        (_write(HEADER + "zzzz,cf2,1,2,3\n"), r"labels\.csv:2: .*Add the image, or delete"),
-        (_write(HEADER + "\na.png,cf2,1,x,3\n"), r"labels\.csv:3: v_px is 'x', not a number"),
-        (_write(HEADER + "a.png,cf2,1,nan,3\n"), r"v_px is 'nan', not a number"),
-        (_write(HEADER + "a.png,cf2,1,2,0\n"), r"labels\.csv:2: depth_m is 0"),
-        (_write(HEADER + "a.png,cf2,1,2\n"), r"labels\.csv:2: not as many cells"),
-        (_write(HEADER + "a.png,cf2,1,2,3,4\n"), r"labels\.csv:2: not as many cells"),
-        (_write(HEADER + "a.png,,1,2,3\n"), r"labels\.csv:2: u_px without a peer"),
-        (_write(HEADER + "a.png,cf2,1,2,3\na.png,,,,\n"), r"labels\.csv:3: .*empty peer"),
-        (_write(HEADER + "a.png,cf2,1,2,3\n" * 2), r"labels\.csv:3: .*cf2 from hand already"),
-        (_write("file,peer,u,v_px,depth_m\n"), r"labels\.csv:1: unknown column 'u'"),
-        (_write("file,u_px,v_px\n"), r"labels\.csv:1: no column peer"),
-        (_write(HEADER.strip() + ",peer\n"), r"labels\.csv:1: a column appears twice"),
-        (_write(HEADER.strip() + ",left_px\na.png,cf2,1,2,3,4\n"), r"labels\.csv:2: not a box"),
+        (_write_labels(HEADER + "a.pgn,cf2,1,2,3\n"), r"labels\.csv:2: .*'a\.pgn' .*mean a\.png\?"),
+        (_write_labels(HEADER + "zzzz,cf2,1,2,3\n"), r"labels\.csv:2: .*Add the image, or delete"),
         (
-            _write(HEADER.strip() + ",visible_share\na.png,cf2,1,2,3,40\n"),
+            _write_labels(HEADER + "\na.png,cf2,1,x,3\n"),
+            r"labels\.csv:3: v_px is 'x', not a number",
+        ),
+        (_write_labels(HEADER + "a.png,cf2,1,nan,3\n"), r"v_px is 'nan', not a number"),
+        (_write_labels(HEADER + "a.png,cf2,1,2,0\n"), r"labels\.csv:2: depth_m is 0"),
+        (_write_labels(HEADER + "a.png,cf2,1,2\n"), r"labels\.csv:2: not as many cells"),
+        (_write_labels(HEADER + "a.png,cf2,1,2,3,4\n"), r"labels\.csv:2: not as many cells"),
+        (_write_labels(HEADER + "a.png,,1,2,3\n"), r"labels\.csv:2: u_px without a peer"),
+        (_write_labels(HEADER + "a.png,cf2,1,2,3\na.png,,,,\n"), r"labels\.csv:3: .*empty peer"),
+        (
+            _write_labels(HEADER + "a.png,cf2,1,2,3\n" * 2),
+            r"labels\.csv:3: .*cf2 from hand already",
+        ),
+        (_write_labels("file,peer,u,v_px,depth_m\n"), r"labels\.csv:1: unknown column 'u'"),
+        (_write_labels("file,u_px,v_px\n"), r"labels\.csv:1: no column peer"),
+        (_write_labels(HEADER.strip() + ",peer\n"), r"labels\.csv:1: a column appears twice"),
+        (
+            _write_labels(HEADER.strip() + ",left_px\na.png,cf2,1,2,3,4\n"),
+            r"labels\.csv:2: not a box",
+        ),
+        (
+            _write_labels(HEADER.strip() + ",visible_share\na.png,cf2,1,2,3,40\n"),
             r":2: visible_share is 40",
         ),
-        (_write(HEADER.strip() + ",sigma_u_px\na.png,cf2,1,2,3,-1\n"), r":2: a sigma is negative"),
         (
-            _write(HEADER.strip() + ",split\na.png,cf2,1,2,3,test\na.png,cf3,1,2,3,\n"),
+            _write_labels(HEADER.strip() + ",sigma_u_px\na.png,cf2,1,2,3,-1\n"),
+            r":2: a sigma is negative",
+        ),
+        (
+            _write_labels(HEADER.strip() + ",split\na.png,cf2,1,2,3,test\na.png,cf3,1,2,3,\n"),
             r"labels\.csv:3: a\.png is in split none and in test",
         ),
-        (_write(""), r"labels\.csv:1: no column file, peer"),
+        (_write_labels(""), r"labels\.csv:1: no column file, peer"),
         (lambda folder: (folder / "labels.csv").write_bytes(b"\xff\xfe\0") and None, "not a CSV"),
         (lambda folder: (folder / "123456789012.png").write_bytes(b"") and None, "by its time"),
     ],
@@ -167,7 +182,7 @@ def test_a_label_file_that_was_named_must_be_there(folder: Path) -> None:
 
 def test_a_camera_of_another_size_is_refused(folder: Path) -> None:
     with pytest.raises(SettingError, match=r"a\.png is 64x48 px, its camera 320x224\."):
-        samples(folder, "CompressedImage", Options(camera=AIDECK))
+        read_samples(folder, "CompressedImage", Options(camera=AIDECK))
 
 
 def test_two_pictures_of_one_time_are_refused(tmp_path: Path) -> None:
@@ -178,7 +193,7 @@ def test_two_pictures_of_one_time_are_refused(tmp_path: Path) -> None:
 
 
 def test_real_frames_convert(data: Path) -> None:
-    found = samples(data / "aideck-frames", "CompressedImage", Options(camera=AIDECK))
+    found = read_samples(data / "aideck-frames", "CompressedImage", Options(camera=AIDECK))
     paths = sorted((data / "aideck-frames").glob("*.ppm"))
     for path, sample in zip(paths, found, strict=True):
         np.testing.assert_array_equal(decode(sample.fields["data"]), decode(path.read_bytes()))
@@ -188,12 +203,12 @@ def test_firmware_text_file_becomes_messages_and_labels(folder: Path) -> None:
     lines = ["deck/a.png 1.5 -2.0 1.0 0.2 -0.1 1.03", "c.ppm,0,0,2,0,0,2", ""]
     (folder / "label.txt").write_text("\n".join(lines))
     camera = replace(AIDECK, width_px=64, height_px=48, cx_px=32, cy_px=24, fx_px=40, fy_px=40)
-    found = samples(folder, "PeerPosition")
+    found = read_samples(folder, "PeerPosition")
     assert [[s.fields[axis] for axis in "xyz"] for s in found] == [[1, 0.2, -0.1], [2, 0, 0]]
-    attitude = samples(folder, "Attitude")[0].fields
-    assert attitude["pitch_rad"] == pytest.approx(np.radians(2.0))  # logged nose up
-    assert samples(folder, "PeerLabels") == []  # no camera
-    first, last = samples(folder, "PeerLabels", Options(camera=camera))
+    attitude = read_samples(folder, "Attitude")[0].fields
+    assert attitude["pitch_rad"] == pytest.approx(np.radians(2.0))  # logged positive nose up
+    assert read_samples(folder, "PeerLabels") == []  # no camera
+    first, last = read_samples(folder, "PeerLabels", Options(camera=camera))
     assert last.fields["peers"][0]["u_px"] == pytest.approx(32)
     assert first.fields["peers"][0]["source"] == "estimate"
 
@@ -208,29 +223,29 @@ def test_firmware_text_file_becomes_messages_and_labels(folder: Path) -> None:
 def test_a_wrong_line_of_the_firmware_s_text_is_named(folder: Path, line: str, text: str) -> None:
     (folder / "label.txt").write_text(line + "\n")
     with pytest.raises(SourceError, match=text):
-        samples(folder, "PeerPosition")
+        read_samples(folder, "PeerPosition")
 
 
 def test_firmware_text_file_without_camera_is_reported(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (folder / "label.txt").write_text("a.png 1 2 1.0 0.1 0.0 1.0\n")
-    assert not samples(folder, "PeerLabels")
+    assert not read_samples(folder, "PeerLabels")
     assert "label.txt gives no labels without a camera. Pass: --camera" in capsys.readouterr().err
 
 
 def test_raw_pictures_get_their_colours(tmp_path: Path) -> None:
     raw = np.random.default_rng(3).integers(0, 256, (24, 32), np.uint8)
     (tmp_path / "a.pgm").write_bytes(b"P5\n32 24\n255\n" + raw.tobytes())
-    (grey,) = samples(tmp_path, "CompressedImage")
+    (grey,) = read_samples(tmp_path, "CompressedImage")
     np.testing.assert_array_equal(decode(grey.fields["data"])[..., 0], raw)
-    (colour,) = samples(tmp_path, "CompressedImage", Options(raw=True))
+    (colour,) = read_samples(tmp_path, "CompressedImage", Options(raw=True))
     np.testing.assert_array_equal(decode(colour.fields["data"]), demosaic(raw))
 
 
 def test_coloured_pictures_are_not_raw(folder: Path) -> None:
     with pytest.raises(SettingError, match=r"has colours already.* Remove --raw"):
-        samples(folder, "CompressedImage", Options(raw=True))
+        read_samples(folder, "CompressedImage", Options(raw=True))
 
 
 @pytest.mark.heavy
@@ -240,11 +255,11 @@ def test_full_sensor_images_are_cropped_to_the_camera(tmp_path: Path) -> None:
     (tmp_path / "labels.csv").write_text("file,peer,u_px,v_px,depth_m\na.png,cf2,102,110,1\n")
     for size_px in (None, (320, 224)):
         options = Options(camera=AIDECK, size_px=size_px)
-        (picture,) = samples(tmp_path, "CompressedImage", options)
+        (picture,) = read_samples(tmp_path, "CompressedImage", options)
         np.testing.assert_array_equal(decode(picture.fields["data"]), whole[10:234, 2:322])
-        (camera,) = samples(tmp_path, "CameraCalibration", options)
+        (camera,) = read_samples(tmp_path, "CameraCalibration", options)
         assert camera.fields["K"][2] == AIDECK.cx_px
-        (label,) = samples(tmp_path, "PeerLabels", options)
+        (label,) = read_samples(tmp_path, "PeerLabels", options)
         assert (label.fields["peers"][0]["u_px"], label.fields["peers"][0]["v_px"]) == (100, 100)
 
 
@@ -265,12 +280,12 @@ def test_full_sensor_images_scale_the_camera_matrix(
     (tmp_path / "a.png").write_bytes(encode_png(whole))
     (tmp_path / "labels.csv").write_text("file,peer,u_px,v_px,depth_m\na.png,cf2,102,110,1\n")
     options = Options(camera=AIDECK, size_px=size_px)
-    (picture,) = samples(tmp_path, "CompressedImage", options)
+    (picture,) = read_samples(tmp_path, "CompressedImage", options)
     assert decode(picture.fields["data"]).shape == (size_px[1], size_px[0], 3)
-    (camera,) = samples(tmp_path, "CameraCalibration", options)
+    (camera,) = read_samples(tmp_path, "CameraCalibration", options)
     assert [camera.fields["K"][k] for k in (0, 2, 5)] == pytest.approx(wanted)
     assert (camera.fields["width"], camera.fields["height"]) == size_px
-    (label,) = samples(tmp_path, "PeerLabels", options)
+    (label,) = read_samples(tmp_path, "PeerLabels", options)
     assert (label.fields["peers"][0]["u_px"], label.fields["peers"][0]["v_px"]) == label_px
 
 
@@ -286,7 +301,7 @@ def test_given_camera_precedes_calibration_file(folder: Path) -> None:
     near = replace(AIDECK, width_px=64, height_px=48, cx_px=30.0)
     (folder / "calibration.toml").write_text(format_camera(near))
     for camera, cx_px in ((None, 30.0), (replace(near, cx_px=31.0), 31.0)):
-        (found,) = samples(folder, "CameraCalibration", Options(camera=camera))
+        (found,) = read_samples(folder, "CameraCalibration", Options(camera=camera))
         assert found.fields["K"][2] == cx_px
         assert found.time_ns == 0
 
@@ -296,7 +311,7 @@ def test_a_mount_that_a_recording_does_not_hold_is_named(
     pitch_rad: float, folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     camera = replace(AIDECK, width_px=64, height_px=48, mount_rad=(0.0, pitch_rad, 0.0))
-    samples(folder, "CameraCalibration", Options(camera=camera))
+    read_samples(folder, "CameraCalibration", Options(camera=camera))
     assert ("cf1: a recording does not hold the mount" in capsys.readouterr().err) == bool(
         pitch_rad
     )
@@ -310,7 +325,7 @@ def test_missing_camera_is_reported_only_if_labels_depend_on_it(
     if labelled:
         (folder / "labels.csv").write_text(HEADER + "a.png,cf2,10,20,0.8\n")
     known = replace(AIDECK, width_px=64, height_px=48) if camera else None
-    assert len(samples(folder, "PeerLabels", Options(camera=known))) == max(labelled, camera)
+    assert len(read_samples(folder, "PeerLabels", Options(camera=known))) == max(labelled, camera)
     assert ("gives no labels without a camera" in capsys.readouterr().err) == bool(said)
 
 
@@ -322,8 +337,8 @@ def test_raw_pictures_are_of_four_by_four_pixels_at_least(
     head = f"P5\n{width} {height}\n255\n".encode()
     (tmp_path / "a.pgm").write_bytes(head + bytes(width * height))
     if size == (4, 4):
-        assert samples(tmp_path, "CompressedImage", Options(raw=True))
+        assert read_samples(tmp_path, "CompressedImage", Options(raw=True))
         return
     with count_left_out() as counted:
-        assert not samples(tmp_path, "CompressedImage", Options(raw=True))
+        assert not read_samples(tmp_path, "CompressedImage", Options(raw=True))
     assert counted.counts == {"images that cannot be decoded": 1}

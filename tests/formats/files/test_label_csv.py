@@ -17,13 +17,15 @@ FULL = LabelRow(
 )
 
 
-def read(folder: Path, text: str) -> dict[str, list[LabelRow]]:
+def write_and_read(folder: Path, text: str) -> dict[str, list[LabelRow]]:
+    """Write a text to labels.csv; return its rows by image."""
     path = folder / "labels.csv"
     path.write_text(text)
     return read_labels(path, ["a.png", "b.png"])
 
 
-def written(*rows: LabelRow) -> str:
+def format_rows(*rows: LabelRow) -> str:
+    """Return the text of a label file with these rows."""
     stream = io.StringIO()
     write_labels(stream, rows)
     return stream.getvalue()
@@ -32,14 +34,14 @@ def written(*rows: LabelRow) -> str:
 def test_label_rows_are_read_as_written(tmp_path: Path) -> None:
     bare = LabelRow("b.png", "cf3", 4.0, 5.0, 6.0)
     nobody = LabelRow("a.png", "", source="truth", split="train")
-    assert read(tmp_path, written(FULL, bare)) == {"a.png": [FULL], "b.png": [bare]}
-    assert read(tmp_path, written(nobody)) == {"a.png": [nobody]}
+    assert write_and_read(tmp_path, format_rows(FULL, bare)) == {"a.png": [FULL], "b.png": [bare]}
+    assert write_and_read(tmp_path, format_rows(nobody)) == {"a.png": [nobody]}
     assert (bare.box_px, bare.visible_share, bare.source, bare.split) == ((), 0.0, "hand", None)
     assert bare.sigmas == (0.0, 0.0, 0.0)
 
 
 def test_cells_match_their_columns_and_unknown_values_are_empty() -> None:
-    head, full, bare, nobody = written(
+    head, full, bare, nobody = format_rows(
         FULL, LabelRow("b.png", "cf3", 4.0, 5.0, 6.0), LabelRow("b.png", "")
     ).splitlines()
     assert head == ",".join(COLUMNS)
@@ -86,32 +88,32 @@ def test_a_point_is_kept_to_a_ten_thousandth_of_a_pixel(u: float, v: float, dept
 def test_label_values_have_limits(tmp_path: Path, cells: str, complaint: str) -> None:
     text = f"{HEADER}a.png,cf2,{cells}\n"
     if not complaint:
-        assert len(read(tmp_path, text)["a.png"]) == 1
+        assert len(write_and_read(tmp_path, text)["a.png"]) == 1
         return
     with pytest.raises(SourceError, match=complaint):
-        read(tmp_path, text)
+        write_and_read(tmp_path, text)
 
 
 def test_a_source_that_no_command_can_choose_is_refused(tmp_path: Path) -> None:
     with pytest.raises(SourceError, match=r"2: source is 'Truth'\. It must be truth, estimate"):
-        read(tmp_path, "file,peer,u_px,v_px,source\na.png,cf2,1,2,Truth\n")
+        write_and_read(tmp_path, "file,peer,u_px,v_px,source\na.png,cf2,1,2,Truth\n")
 
 
 @pytest.mark.parametrize("cell", range(7))
 def test_row_without_peer_must_have_empty_cells(tmp_path: Path, cell: int) -> None:
     cells = ["5" if k == cell else "" for k in range(8)]
     with pytest.raises(SourceError, match="without a peer"):
-        read(tmp_path, f"{HEADER}a.png,,{','.join(cells)}\n")
+        write_and_read(tmp_path, f"{HEADER}a.png,,{','.join(cells)}\n")
 
 
 def test_one_peer_may_have_labels_of_several_sources(tmp_path: Path) -> None:
     rows = [LabelRow("a.png", "cf2", 1, 2, 3, source=source) for source in ("truth", "hand")]
     rows.append(LabelRow("a.png", "cf3", 1, 2, 3))
-    assert read(tmp_path, written(*rows)) == {"a.png": rows}
+    assert write_and_read(tmp_path, format_rows(*rows)) == {"a.png": rows}
     with pytest.raises(SourceError, match=r":5: a\.png has cf3 from hand already"):
-        read(tmp_path, written(*rows, rows[-1]))
+        write_and_read(tmp_path, format_rows(*rows, rows[-1]))
     with pytest.raises(SourceError, match=r":3: .*empty peer, so it may have no other"):
-        read(tmp_path, written(LabelRow("a.png", ""), rows[0]))
+        write_and_read(tmp_path, format_rows(LabelRow("a.png", ""), rows[0]))
 
 
 def test_a_picture_has_so_many_rows_at_most(
@@ -119,23 +121,23 @@ def test_a_picture_has_so_many_rows_at_most(
 ) -> None:
     monkeypatch.setattr(limits, "PEERS", 3)
     rows = [LabelRow("a.png", f"cf{k}", 1, 2, 3) for k in range(4)]
-    assert len(read(tmp_path, written(*rows[:3]))["a.png"]) == 3
+    assert len(write_and_read(tmp_path, format_rows(*rows[:3]))["a.png"]) == 3
     with pytest.raises(SourceError, match=r":5: a\.png has more than 3 rows"):
-        read(tmp_path, written(*rows))
+        write_and_read(tmp_path, format_rows(*rows))
 
 
 def test_misspelled_column_suggests_the_nearest(tmp_path: Path) -> None:
     with pytest.raises(SourceError, match=r"unknown column 'sigma_u'\. Did you mean sigma_u_px\?"):
-        read(tmp_path, "file,peer,u_px,v_px,depth_m,sigma_u\n")
+        write_and_read(tmp_path, "file,peer,u_px,v_px,depth_m,sigma_u\n")
     with pytest.raises(SourceError, match=r"unknown column 'zz'\. Known are file, peer"):
-        read(tmp_path, "file,peer,u_px,v_px,depth_m,zz\n")
+        write_and_read(tmp_path, "file,peer,u_px,v_px,depth_m,zz\n")
 
 
 def test_row_without_peer_keeps_its_source(tmp_path: Path) -> None:
     head = "file,peer,u_px,v_px,depth_m,source\n"
-    found = read(tmp_path, f"{head}a.png,,,,,\nb.png,,,,,truth\n")
+    found = write_and_read(tmp_path, f"{head}a.png,,,,,\nb.png,,,,,truth\n")
     assert (found["a.png"][0].source, found["b.png"][0].source) == ("hand", "truth")
-    found = read(tmp_path, f"{head}a.png,cf2,1,2,3,\nb.png,cf2,1,2,3,truth\n")
+    found = write_and_read(tmp_path, f"{head}a.png,cf2,1,2,3,\nb.png,cf2,1,2,3,truth\n")
     assert (found["a.png"][0].source, found["b.png"][0].source) == ("hand", "truth")
 
 
@@ -158,4 +160,4 @@ def test_label_rows_round_trip(
         sigmas=(sigmas[0] / 4, sigmas[1] / 4, sigmas[2] / 4),
     )
     if row.box_px[0] < row.box_px[2] and row.box_px[1] < row.box_px[3]:
-        assert read(tmp_path_factory.getbasetemp(), written(row)) == {"a.png": [row]}
+        assert write_and_read(tmp_path_factory.getbasetemp(), format_rows(row)) == {"a.png": [row]}

@@ -1,4 +1,4 @@
-"""New names of robots that fit nothing, or two robots, are no silent guess."""
+"""New names of robots that match no robot, or two robots, are reported."""
 
 from pathlib import Path
 
@@ -23,7 +23,7 @@ OWN = "time_s,roll_rad,pitch_rad,yaw_rate_radps,vx_mps,vy_mps,height_m\n"
 
 @pytest.fixture
 def logs(tmp_path: Path) -> Path:
-    """The logs of two robots, and beside them the table of their columns."""
+    """Return a folder with the logs of two robots; their column map is beside it."""
     (tmp_path / "map.toml").write_text(TABLE)
     folder = tmp_path / "logs"
     folder.mkdir()

@@ -1,4 +1,4 @@
-"""Sensors of other robots read by one column map: a file per robot, columns, or rows."""
+"""One column map reads several robots: in a file each, in columns each, or in rows each."""
 
 import math
 from pathlib import Path
@@ -25,8 +25,8 @@ QUANTITIES = {
 }
 
 
-def table(form: str = "{}", more: str = "", peer: str = "range_{peer}") -> str:
-    """A table whose columns are named like the quantities."""
+def format_map(form: str = "{}", more: str = "", peer: str = "range_{peer}") -> str:
+    """Return a column map; ``form`` makes the name of a column from that of its quantity."""
     text = more
     for name, unit in QUANTITIES.items():
         column = name if name == "time" else form.format(name)
@@ -35,14 +35,14 @@ def table(form: str = "{}", more: str = "", peer: str = "range_{peer}") -> str:
     return text + f'[range."*"]\nname = "{form.format(peer)}"\nunit = "m"\n'
 
 
-def table_in_docs() -> str:
-    """The table that docs/own_robot.md shows."""
+def read_documented_map() -> str:
+    """Return the column map of docs/own_robot.md."""
     page = Path(__file__).parents[3] / "docs" / "own_robot.md"
     return page.read_text(encoding="utf-8").partition("```toml\n")[2].partition("```")[0]
 
 
-def drive(rate_hz: float = 50.0) -> tuple[np.ndarray, dict[str, dict[str, np.ndarray]]]:
-    """The rover and the boat of docs/own_robot.md, and what each of them measures."""
+def simulate_drive(rate_hz: float = 50.0) -> tuple[np.ndarray, dict[str, dict[str, np.ndarray]]]:
+    """Return times, s, and the noisy measurements of a rover and a boat that drive for a minute."""
     rng = np.random.default_rng(3)
     time_s = np.arange(0.0, 60.0, 1 / rate_hz)
     paths = {
@@ -67,46 +67,48 @@ def drive(rate_hz: float = 50.0) -> tuple[np.ndarray, dict[str, dict[str, np.nda
     return time_s, logs
 
 
-def lines(columns: dict[str, np.ndarray]) -> list[str]:
-    """Rows of numbers below their names."""
+def format_table(columns: dict[str, np.ndarray]) -> list[str]:
+    """Return the lines of a CSV table with a header."""
     rows = np.column_stack(list(columns.values()))
     return [",".join(columns), *(",".join(f"{x:.9g}" for x in row) for row in rows)]
 
 
-def write(folder: Path, layout: str) -> Path:
-    """The drive in one of three layouts, with its table; return the source."""
-    time_s, logs = drive()
-    if layout == "a file a robot":
+def write_drive(folder: Path, layout: str) -> Path:
+    """Write the drive in one of three layouts, and its column map; return the source."""
+    time_s, logs = simulate_drive()
+    if layout == "a file per robot":
         (folder / "logs").mkdir()
         for own, log in logs.items():
-            (folder / "logs" / f"{own}.csv").write_text("\n".join(lines({"time": time_s} | log)))
-        (folder / "map.toml").write_text(table_in_docs())
+            (folder / "logs" / f"{own}.csv").write_text(
+                "\n".join(format_table({"time": time_s} | log))
+            )
+        (folder / "map.toml").write_text(read_documented_map())
         return folder / "logs"
-    if layout == "columns of robots":
+    if layout == "columns per robot":
         wide = {f"{own}_{name}": x for own, log in logs.items() for name, x in log.items()}
-        (folder / "all.csv").write_text("\n".join(lines({"time": time_s} | wide)))
-        (folder / "map.toml").write_text(table("{{robot}}_{}"))
+        (folder / "all.csv").write_text("\n".join(format_table({"time": time_s} | wide)))
+        (folder / "map.toml").write_text(format_map("{{robot}}_{}"))
         return folder / "all.csv"
     rows = []
     for own, log in logs.items():
         padded = {"time": time_s} | log
         padded = {n: padded.get(n, np.full(len(time_s), np.nan)) for n in ALL_COLUMNS}
-        head, *mine = lines(padded)
+        head, *mine = format_table(padded)
         rows += [f"{line},{own}" for line in mine]
     (folder / "all.csv").write_text("\n".join([f"{head},who", *rows]))
-    (folder / "map.toml").write_text(table(more='[robot]\nname = "who"\n'))
+    (folder / "map.toml").write_text(format_map(more='[robot]\nname = "who"\n'))
     return folder / "all.csv"
 
 
 ALL_COLUMNS = (*QUANTITIES, "range_boat", "range_rover")
-LAYOUTS = ("a file a robot", "columns of robots", "rows of robots")
+LAYOUTS = ("a file per robot", "columns per robot", "rows per robot")
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_one_column_map_serves_all_robots(layout: str, tmp_path: Path) -> None:
-    source = write(tmp_path, layout)
+    source = write_drive(tmp_path, layout)
     out = dmrl.convert(source, tmp_path / "out.mcap", columns=tmp_path / "map.toml").path
-    time_s, logs = drive()
+    time_s, logs = simulate_drive()
     for own, peer in (("rover", "boat"), ("boat", "rover")):
         wanted = {
             f"/{own}/attitude": {n: f"{n}_rad" for n in ("roll", "pitch")}
@@ -123,9 +125,9 @@ def test_one_column_map_serves_all_robots(layout: str, tmp_path: Path) -> None:
 
 
 def test_own_sensors_are_labelled_both_ways(tmp_path: Path) -> None:
-    source = write(tmp_path, "a file a robot")
-    drive_ = dmrl.convert(source, tmp_path / "out.mcap", columns=tmp_path / "map.toml")
-    labelled = dmrl.label(drive_.path, tmp_path / "labelled.mcap")
+    source = write_drive(tmp_path, "a file per robot")
+    recording = dmrl.convert(source, tmp_path / "out.mcap", columns=tmp_path / "map.toml")
+    labelled = dmrl.label(recording.path, tmp_path / "labelled.mcap")
     for own, peer in (("rover", "boat"), ("boat", "rover")):
         position = labelled[f"/{own}/peer/{peer}/position"].to_pandas()
         assert (position["status"] == "OK").mean() > 0.25
@@ -134,7 +136,7 @@ def test_own_sensors_are_labelled_both_ways(tmp_path: Path) -> None:
 def test_robots_may_have_different_sensors(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    source = write(tmp_path, "a file a robot")
+    source = write_drive(tmp_path, "a file per robot")
     boat = source / "boat.csv"
     rows = [line.split(",") for line in boat.read_text().splitlines()]
     at = rows[0].index("height")
@@ -161,7 +163,7 @@ def test_robots_may_have_different_sensors(
 
 
 def test_robots_and_peers_are_renamed(tmp_path: Path) -> None:
-    source = write(tmp_path, "columns of robots")
+    source = write_drive(tmp_path, "columns per robot")
     options = Options(columns=tmp_path / "map.toml", names={"rover": "a", "boat": "b"})
     found = {s.topic for s in mapped_csv.load_content(source, options).samples}
     assert {"/a/range/b", "/b/range/a", "/a/velocity"} < found

@@ -1,4 +1,4 @@
-"""Ranges of which a row names the peer, and columns that name none."""
+"""Ranges whose peer is named by another column of the row."""
 
 from pathlib import Path
 
@@ -17,14 +17,14 @@ ROWS = "t,from,to,d\n0.0,a,b,100\n0.0,a,c,500\n0.0,b,a,110\n0.1,a,b,101\n0.1,a,c
 
 @pytest.fixture
 def source(tmp_path: Path) -> Path:
-    """Ranges of three robots, a row for each."""
+    """Return a file with a row for each range between three robots."""
     path = tmp_path / "ranges.csv"
     path.write_text(ROWS)
     return path
 
 
-def convert(source: Path, text: str, **options: str) -> dict[str, list[float]]:
-    """Ranges by topic."""
+def read_ranges(source: Path, text: str, **options: str) -> dict[str, list[float]]:
+    """Return the ranges, metres, by topic; ``options`` rename robots."""
     table = source.with_name("map.toml")
     table.write_text(text)
     made = Options(columns=table, names=options)
@@ -36,7 +36,7 @@ def convert(source: Path, text: str, **options: str) -> dict[str, list[float]]:
 
 
 def test_rows_name_their_peer(source: Path) -> None:
-    assert convert(source, TIME_AND_ROBOT + PEER + ANY_RANGE, c="cf3") == {
+    assert read_ranges(source, TIME_AND_ROBOT + PEER + ANY_RANGE, c="cf3") == {
         "/a/range/b": [1.0, 1.01],
         "/a/range/cf3": [5.0],
         "/b/range/a": [pytest.approx(1.1)],
@@ -47,14 +47,14 @@ def test_rows_name_their_peer(source: Path) -> None:
 def test_a_column_is_not_the_range_to_two_peers(source: Path) -> None:
     ranges = "".join(f'[range.{peer}]\nname = "d"\nunit = "cm"\n' for peer in "abc")
     with pytest.raises(SourceError, match=r"d cannot be the range of a to both b and c.*\[peer\]"):
-        convert(source, TIME_AND_ROBOT + ranges)
+        read_ranges(source, TIME_AND_ROBOT + ranges)
 
 
 def test_a_file_with_ranges_to_its_own_robot_alone_is_named(
     source: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     ranges = ANY_RANGE.replace('"*"', "cf1")
-    assert not convert(source, TIME_AND_ROBOT.split("[robot]")[0] + ranges)
+    assert not read_ranges(source, TIME_AND_ROBOT.split("[robot]")[0] + ranges)
     assert (
         "nothing is of cf1, which has no range to itself. Try: --robot" in capsys.readouterr().err
     )
@@ -71,7 +71,7 @@ def test_a_file_with_ranges_to_its_own_robot_alone_is_named(
 )
 def test_tables_that_name_no_peer_are_refused(source: Path, text: str, fault: str) -> None:
     with pytest.raises(SourceError, match=fault):
-        convert(source, TIME_AND_ROBOT + text)
+        read_ranges(source, TIME_AND_ROBOT + text)
 
 
 def test_topics_take_no_column_of_peers(source: Path) -> None:

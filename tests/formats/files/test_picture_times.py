@@ -1,4 +1,4 @@
-"""Times of pictures by their names."""
+"""Times of images are read from their names."""
 
 from pathlib import Path
 
@@ -43,7 +43,7 @@ def test_a_time_has_twelve_digits(digits: int, timed: bool, tmp_path: Path) -> N
         (("000000000001", "000000000002"), (0, 100_000_000), "numbers, too near for times"),
     ],
 )
-def test_numbers_are_times_in_a_unit_in_which_a_camera_can_be_that_fast(
+def test_unit_of_numeric_names_is_inferred_from_a_plausible_image_rate(
     names: tuple[str, ...],
     times: tuple[int, int],
     said: str,
@@ -97,7 +97,7 @@ def test_numbers_that_are_no_dates_are_none(
     ("names", "why"),
     [
         (("20241301120000", "20241301120002"), "month must be in 1..12"),
-        (("20240015120000", "20240015130000"), "month must be in 1..12"),  # months from 0
+        (("20240015120000", "20240015130000"), "month must be in 1..12"),  # months counted from 0
         (("20240301120000", "20240301120060"), "second must be in 0..59"),
         (("20240230120000123", "20240230120000456"), "day is out of range for month"),
     ],

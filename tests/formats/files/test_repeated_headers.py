@@ -1,4 +1,4 @@
-"""Headers among the rows of a text table, as a logger that starts again writes them."""
+"""Repeated headers in a text table, as written by a logger that restarts."""
 
 from pathlib import Path
 
@@ -10,6 +10,7 @@ from dmrl.terminal.left_out import count_left_out
 
 
 def read_column(path: Path, text: str, name: str) -> list[str]:
+    """Write a text to a file; return the cells of a column."""
     path.write_text(text)
     return read_table(path).columns[name]
 
@@ -30,7 +31,7 @@ def test_a_header_of_other_columns_is_refused(tmp_path: Path) -> None:
         read_column(tmp_path / "a.csv", text, "roll")
 
 
-def test_rows_of_text_are_no_headers(tmp_path: Path) -> None:
+def test_text_rows_are_not_taken_for_headers(tmp_path: Path) -> None:
     text = "t,robot,mode\n1,cf1,up\n-,robot,mode\n2,cf1,down\n"
     assert read_column(tmp_path / "a.csv", text, "mode") == ["up", "mode", "down"]
 
@@ -38,8 +39,8 @@ def test_rows_of_text_are_no_headers(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "kept"),
     [
-        ("2.3\n", 12),  # a whole line
-        ("2.300", 12),  # as those above it
+        ("2.3\n", 12),  # the newline shows that the number is complete
+        ("2.300", 12),  # as many decimals as in the rows above
         ("2.3", 11),
         ("2", 11),
         ("", 12),

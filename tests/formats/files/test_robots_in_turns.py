@@ -1,4 +1,4 @@
-"""A file of several robots whose table does not name the column that tells them apart."""
+"""A file with rows of several robots whose column map names no robot column."""
 
 from pathlib import Path
 
@@ -20,7 +20,7 @@ TABLE = '[time]\nname = "t"\nunit = "s"\n[height]\nname = "z"\nunit = "m"\n'
         ("robot", ("cf1", "cf1"), False),
     ],
 )
-def test_robots_in_turns_are_doubted(
+def test_alternating_robots_are_reported(
     name: str,
     values: tuple[str, str],
     doubted: bool,
@@ -35,7 +35,9 @@ def test_robots_in_turns_are_doubted(
     assert (f"{name!r} is {values[0]}, {values[1]} in turns" in told) == doubted
 
 
-def test_changing_modes_are_no_robots(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_changing_text_columns_are_not_taken_for_robots(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     rows = [f"{0.01 * k:.2f},{'up' if k < 10 else 'down'},1" for k in range(20)]
     (path := tmp_path / "a.csv").write_text("\n".join(["t,robot,z", *rows]))
     (table := tmp_path / "a.toml").write_text(TABLE)

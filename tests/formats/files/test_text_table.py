@@ -1,4 +1,4 @@
-"""Tables in text files, as pandas, R, spreadsheets and loggers write them."""
+"""Text tables as written by pandas, R, spreadsheets and loggers."""
 
 import io
 from collections.abc import Callable
@@ -20,6 +20,8 @@ from dmrl.formats.files.text_table import Dialect, read_table
 from dmrl.samples.sample import Sample
 from dmrl.terminal.left_out import count_left_out
 
+from ..reading import group_by_topic
+
 WANTED = ("t", "roll", "pitch", "d2")
 TIME_S = np.arange(200) / 50
 VALUES = np.column_stack(
@@ -27,56 +29,56 @@ VALUES = np.column_stack(
 ).round(6)
 
 
-def plain(separator: str = ",", decimal: str = ".", header: str = "", before: str = "") -> str:
-    """The table, written cell by cell."""
+def to_text(separator: str = ",", decimal: str = ".", header: str = "", before: str = "") -> str:
+    """Return the table as text."""
     rows = [separator.join(f"{x:.6f}".replace(".", decimal) for x in row) for row in VALUES]
     return before + "\n".join([header or separator.join(WANTED), *rows]) + "\n"
 
 
-def by_pandas(**how: object) -> str:
-    """The table, as pandas writes it."""
+def to_text_by_pandas(**how: object) -> str:
+    """Return the table as text written by pandas."""
     text = io.StringIO()
     pandas.DataFrame(VALUES, columns=list(WANTED)).to_csv(text, **how)
     return text.getvalue()
 
 
-def with_note(text: str) -> str:
-    """Each row ends with a quoted text of two lines that has separators in it."""
+def append_note(text: str) -> str:
+    """Append a quoted cell of two lines, with separators in it, to each row."""
     first, *rows = text.splitlines()
     return "\n".join([first + ",note", *(f'{row},"a, #b\n{k}"' for k, row in enumerate(rows))])
 
 
 TEXTS: dict[str, Callable[[], str]] = {
-    "plain": plain,
-    "semicolon": lambda: plain(";"),
-    "tab": lambda: plain("\t"),
-    "pipe": lambda: plain("|"),
-    "space": lambda: plain(" "),
-    "columns of spaces": lambda: plain("   "),
-    "decimal comma": lambda: plain(";", ","),
-    "decimal comma, tab": lambda: plain("\t", ","),
-    "comments above": lambda: plain(before="# a log\n#of two, robots\n\n"),
-    "comments of percent": lambda: plain(before="% a log\n"),
-    "comments of C": lambda: plain(before="// a log\n"),
-    "header is a comment": lambda: plain(header="# t,roll,pitch,d2"),
-    "header as rostopic's": lambda: plain(header="%t,roll,pitch,d2"),
-    "comments between": lambda: plain().replace("\n1.0", "\n# a pause\n1.0"),
-    "comments behind": lambda: plain().replace("\n1.0", " # a pause\n1.0"),
-    "title above": lambda: plain(before="Flight of Monday\n\n"),
-    "quoted header": lambda: plain(header='"t","roll","pitch","d2"'),
-    "spaces in header": lambda: plain(header="t, roll ,  pitch, d2"),
-    "units in header": lambda: plain(header="t [s],roll [rad],pitch (rad),d2 / m"),
-    "a line of units": lambda: plain(header="t,roll,pitch,d2\ns,rad,rad,m"),
-    "separator at the end": lambda: plain().replace("\n", ",\n"),
-    "separator at the end of rows": lambda: plain().replace("\n", ",\n").replace(",\n", "\n", 1),
-    "names of rows, as R": lambda: by_pandas(index_label=False),
-    "index of pandas": by_pandas,
-    "all quoted": lambda: by_pandas(index=False, quoting=1),
-    "blank lines": lambda: plain().replace("\n", "\n\n"),
-    "lines of Windows": lambda: plain().replace("\n", "\r\n"),
-    "lines of old Macs": lambda: plain().replace("\n", "\r"),
-    "text of two lines": lambda: with_note(plain()),
-    "no end of line": lambda: plain().rstrip("\n"),
+    "plain": to_text,
+    "semicolon": lambda: to_text(";"),
+    "tab": lambda: to_text("\t"),
+    "pipe": lambda: to_text("|"),
+    "space": lambda: to_text(" "),
+    "columns of spaces": lambda: to_text("   "),
+    "decimal comma": lambda: to_text(";", ","),
+    "decimal comma, tab": lambda: to_text("\t", ","),
+    "comments above": lambda: to_text(before="# a log\n#of two, robots\n\n"),
+    "comments of percent": lambda: to_text(before="% a log\n"),
+    "comments of C": lambda: to_text(before="// a log\n"),
+    "header is a comment": lambda: to_text(header="# t,roll,pitch,d2"),
+    "header as rostopic's": lambda: to_text(header="%t,roll,pitch,d2"),
+    "comments between": lambda: to_text().replace("\n1.0", "\n# a pause\n1.0"),
+    "comments behind": lambda: to_text().replace("\n1.0", " # a pause\n1.0"),
+    "title above": lambda: to_text(before="Flight of Monday\n\n"),
+    "quoted header": lambda: to_text(header='"t","roll","pitch","d2"'),
+    "spaces in header": lambda: to_text(header="t, roll ,  pitch, d2"),
+    "units in header": lambda: to_text(header="t [s],roll [rad],pitch (rad),d2 / m"),
+    "a line of units": lambda: to_text(header="t,roll,pitch,d2\ns,rad,rad,m"),
+    "separator at the end": lambda: to_text().replace("\n", ",\n"),
+    "separator at the end of rows": lambda: to_text().replace("\n", ",\n").replace(",\n", "\n", 1),
+    "names of rows, as R": lambda: to_text_by_pandas(index_label=False),
+    "index of pandas": to_text_by_pandas,
+    "all quoted": lambda: to_text_by_pandas(index=False, quoting=1),
+    "blank lines": lambda: to_text().replace("\n", "\n\n"),
+    "lines of Windows": lambda: to_text().replace("\n", "\r\n"),
+    "lines of old Macs": lambda: to_text().replace("\n", "\r"),
+    "text of two lines": lambda: append_note(to_text()),
+    "no end of line": lambda: to_text().rstrip("\n"),
 }
 
 
@@ -98,10 +100,10 @@ def test_every_form_gives_the_same_rows(form: str, encoding: str, tmp_path: Path
 @pytest.mark.parametrize(
     ("data", "said"),
     [
-        (plain(before="# Flug über\n").encode("latin-1"), "is not UTF-8; read as Latin-1"),
-        (plain().encode("utf-16-le"), ""),
-        (plain().encode("utf-32"), ""),
-        (plain(";", ",").encode(), "read with decimal commas"),
+        (to_text(before="# Flug über\n").encode("latin-1"), "is not UTF-8; read as Latin-1"),
+        (to_text().encode("utf-16-le"), ""),
+        (to_text().encode("utf-32"), ""),
+        (to_text(";", ",").encode(), "read with decimal commas"),
     ],
 )
 def test_guessed_dialect_is_reported_with_the_deciding_key(
@@ -117,7 +119,7 @@ def test_guessed_dialect_is_reported_with_the_deciding_key(
 def test_given_dialect_overrides_guessing(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    (tmp_path / "a.csv").write_bytes(plain(";", ",", before="! über\n").encode("cp1252"))
+    (tmp_path / "a.csv").write_bytes(to_text(";", ",", before="! über\n").encode("cp1252"))
     dialect = Dialect(";", ",", "cp1252", "!")
     found = read_table(tmp_path / "a.csv", WANTED, dialect).parse_numbers("d2")
     np.testing.assert_array_equal(found, VALUES[:, 3])
@@ -128,7 +130,7 @@ def test_given_dialect_overrides_guessing(
 
 @pytest.mark.parametrize("missing", ["", "NA", "n/a", "NaN", "nan", "null", "None", "-", "?", " "])
 def test_missing_values_are_no_numbers_and_not_counted(missing: str, tmp_path: Path) -> None:
-    lines = plain().splitlines()
+    lines = to_text().splitlines()
     for k in range(3, 200, 7):
         lines[k] = ",".join([*lines[k].split(",")[:3], missing])
     (tmp_path / "a.csv").write_text("\n".join(lines) + "\n")
@@ -139,9 +141,9 @@ def test_missing_values_are_no_numbers_and_not_counted(missing: str, tmp_path: P
 
 
 def test_unusable_cells_and_rows_are_counted_by_line(tmp_path: Path) -> None:
-    lines = plain(before="# a log\n").splitlines()
+    lines = to_text(before="# a log\n").splitlines()
     lines[10] = "0.18,0.1"
-    lines[12] = lines[12].rsplit(",", 1)[0] + ",1_0"  # a number in the source of Python only
+    lines[12] = lines[12].rsplit(",", 1)[0] + ",1_0"  # Python accepts 1_0 as a number
     lines[14] = "1_0,0,0,2"
     (tmp_path / "a.csv").write_text("\n".join([*lines, lines[1], *lines[-1:]]) + "\n")
     with count_left_out() as left_out:
@@ -206,13 +208,10 @@ unit = "m"
 """
 
 
-def samples(folder: Path, **options: object) -> dict[str, list[Sample]]:
-    """Samples of a log by topic."""
-    found: dict[str, list[Sample]] = {}
+def read_samples(folder: Path, **options: object) -> dict[str, list[Sample]]:
+    """Return the samples of log.csv, read by map.toml, by topic."""
     given = Options(columns=folder / "map.toml", **options)  # type: ignore[arg-type]
-    for sample in mapped_csv.load_content(folder / "log.csv", given).samples:
-        found.setdefault(sample.topic, []).append(sample)
-    return found
+    return group_by_topic(mapped_csv.load_content(folder / "log.csv", given).samples)
 
 
 def test_unit_in_the_header_that_differs_is_reported(
@@ -220,7 +219,7 @@ def test_unit_in_the_header_that_differs_is_reported(
 ) -> None:
     (tmp_path / "map.toml").write_text(TABLE)
     (tmp_path / "log.csv").write_text("t [ms],roll (rad),pitch [°],r,d2\n1,0,0,0,2\n2,0,0,0,2.5\n")
-    samples(tmp_path)
+    read_samples(tmp_path)
     err = capsys.readouterr().err
     assert "the header has t in ms, the table in s" in err
     assert "the header has pitch in deg, the table in rad" in err
@@ -232,7 +231,7 @@ def test_two_flights_in_one_file_are_refused_with_the_line(tmp_path: Path) -> No
     flight = [f"{0.02 * k:.2f},0,0,0,2.{k:03d}" for k in range(300)]
     (tmp_path / "log.csv").write_text("\n".join(["# a", "t,roll,pitch,r,d2", *flight, *flight]))
     with pytest.raises(SourceError, match=r"log\.csv:303: time goes back from 5\.98 s to 0 s"):
-        samples(tmp_path)
+        read_samples(tmp_path)
 
 
 @pytest.mark.parametrize("bits", [16, 32])
@@ -243,7 +242,7 @@ def test_signed_counters_wrap_to_negative_numbers(bits: int, tmp_path: Path) -> 
     wrapped = (times_ms + half) % (2 * half) - half
     rows = [f"{t},0,0,0,{2 + 0.01 * k:.2f}" for k, t in enumerate(wrapped)]
     (tmp_path / "log.csv").write_text("\n".join(["t,roll,pitch,r,d2", *rows]))
-    found = samples(tmp_path)["/cf1/range/cf2"]
+    found = read_samples(tmp_path)["/cf1/range/cf2"]
     assert [s.time_ns for s in found] == (times_ms * 1_000_000).tolist()
 
 
@@ -252,7 +251,7 @@ def test_rows_before_time_0_are_left_out(tmp_path: Path) -> None:
     rows = [f"{0.02 * k - 1:.2f},0,0,0,{2 + 0.01 * k:.2f}" for k in range(200)]
     (tmp_path / "log.csv").write_text("\n".join(["t,roll,pitch,r,d2", *rows]))
     with count_left_out() as left_out:
-        found = samples(tmp_path)["/cf1/range/cf2"]
+        found = read_samples(tmp_path)["/cf1/range/cf2"]
     assert [s.time_ns for s in found] == [20_000_000 * k for k in range(150)]
     assert left_out.counts == {"rows with times before 0": 50}
     assert left_out.first["rows with times before 0"].endswith("log.csv:2")
@@ -267,11 +266,11 @@ def test_repeated_ranges_are_counted_once(
     rows = [f"{0.02 * k:.2f},0,0,0,{2 + 0.37 * np.sin(k // 10):.3f}" for k in range(200)]
     (tmp_path / "log.csv").write_text("\n".join(["t,roll,pitch,r,d2", *rows]))
     with count_left_out() as left_out:
-        found = samples(tmp_path)["/cf1/range/cf2"]
+        found = read_samples(tmp_path)["/cf1/range/cf2"]
     assert [s.time_ns for s in found] == [k * 200_000_000 for k in range(count)]
     assert sum(left_out.counts.values()) == counted
     (tmp_path / "map.toml").write_text(TABLE + "held = false\n")
-    assert len(samples(tmp_path)["/cf1/range/cf2"]) == 200
+    assert len(read_samples(tmp_path)["/cf1/range/cf2"]) == 200
 
 
 CELLS = st.one_of(
@@ -337,7 +336,7 @@ def test_decimal_commas_far_below_the_header_are_found(tmp_path: Path) -> None:
 @pytest.mark.parametrize("encoding", ["utf-16-le", "utf-16-be"])
 def test_utf_16_needs_no_mark(encoding: str, tmp_path: Path) -> None:
     path = tmp_path / "a.csv"
-    path.write_bytes(plain().encode(encoding))
+    path.write_bytes(to_text().encode(encoding))
     assert set(read_table(path, WANTED).columns) == set(WANTED)
 
 

@@ -1,4 +1,4 @@
-"""Pictures that EXIF turns, with labels or a camera, which may be of either picture."""
+"""Images that EXIF rotates, with labels or a camera that may refer to either orientation."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -19,15 +19,15 @@ LABELS = "file,peer,u_px,v_px,depth_m,left_px,top_px,right_px,bottom_px\n"
 
 @pytest.fixture
 def photo(tmp_path: Path) -> Path:
-    """Make a folder with a picture of 64 x 48 that is to be turned to 48 x 64."""
+    """Return a folder with an image of 64 x 48 pixels that EXIF rotates to 48 x 64."""
     exif = PIL.Image.Exif()
     exif[0x0112] = 6
     PIL.Image.fromarray(np.zeros((48, 64, 3), np.uint8)).save(tmp_path / "a.png", exif=exif)
     return tmp_path
 
 
-def convert(source: Path, options: Options) -> list[tuple[int, ...]]:
-    """Return the shape of each image, and the edges of each box."""
+def read_shapes(source: Path, options: Options) -> list[tuple[int, ...]]:
+    """Return the shape of each image and the edges of each box, pixels."""
     found = []
     for sample in find_format(source).content(source, options).samples:
         if sample.message == "CompressedImage":
@@ -37,7 +37,7 @@ def convert(source: Path, options: Options) -> list[tuple[int, ...]]:
 
 
 @pytest.mark.parametrize("what", ["labels", "yolo", "camera"])
-def test_nobody_guesses_of_which_picture_labels_and_camera_are(what: str, photo: Path) -> None:
+def test_orientation_of_labels_and_camera_must_be_stated(what: str, photo: Path) -> None:
     options = Options()
     if what == "labels":
         (photo / "labels.csv").write_text(LABELS + ROW)
@@ -46,23 +46,23 @@ def test_nobody_guesses_of_which_picture_labels_and_camera_are(what: str, photo:
     else:
         options = replace(options, camera=replace(AIDECK, width_px=48, height_px=64))
     with pytest.raises(SettingError, match=r"a\.png is turned by EXIF.*--upright.*--as-stored"):
-        convert(photo, options)
-    assert convert(photo, replace(options, as_stored=False))[0] == (64, 48, 3)
+        read_shapes(photo, options)
+    assert read_shapes(photo, replace(options, as_stored=False))[0] == (64, 48, 3)
     stored = replace(options, as_stored=True)
     if options.camera:
         with pytest.raises(SettingError, match="is 64x48 px, its camera 48x64"):
-            convert(photo, stored)
+            read_shapes(photo, stored)
         stored = replace(stored, camera=replace(AIDECK, width_px=64, height_px=48))
-    assert convert(photo, stored)[0] == (48, 64, 3)
+    assert read_shapes(photo, stored)[0] == (48, 64, 3)
 
 
-def test_labels_stay_as_they_are_in_the_picture_that_is_named(photo: Path) -> None:
+def test_labels_are_unchanged_for_either_stated_orientation(photo: Path) -> None:
     (photo / "labels.csv").write_text(LABELS + ROW)
     for as_stored, shape in ((True, (48, 64, 3)), (False, (64, 48, 3))):
-        assert convert(photo, Options(as_stored=as_stored)) == [shape, (4.0, 15.0, 16.0, 25.0)]
+        assert read_shapes(photo, Options(as_stored=as_stored)) == [shape, (4.0, 15.0, 16.0, 25.0)]
 
 
-def test_turned_pictures_without_labels_or_with_nobody_are_upright(photo: Path) -> None:
-    assert convert(photo, Options()) == [(64, 48, 3)]
+def test_rotated_images_without_labels_are_turned_upright(photo: Path) -> None:
+    assert read_shapes(photo, Options()) == [(64, 48, 3)]
     (photo / "labels.csv").write_text(f"{LABELS}a.png,{',' * 7}\n")
-    assert convert(photo, Options()) == [(64, 48, 3)]
+    assert read_shapes(photo, Options()) == [(64, 48, 3)]

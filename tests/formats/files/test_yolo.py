@@ -11,7 +11,16 @@ from dmrl.formats.registry import find_format
 from dmrl.guards import limits
 from dmrl.terminal.left_out import count_left_out
 
-from .boxes import HEIGHT, WIDTH, boxes_of, check, labels_of, read, write_picture, yolo_lines
+from .boxes import (
+    HEIGHT,
+    WIDTH,
+    assert_boxes,
+    find_labels,
+    format_yolo,
+    make_boxes,
+    read_samples,
+    write_picture,
+)
 
 DATA_YAML = "path: /content/elsewhere/set\ntrain: {}\nval: {}\nnc: 2\nnames: {}\n"
 
@@ -46,7 +55,7 @@ def test_yolo_with_splits(
         pictures[split].append(folder / f"img{k}.png")
         label = Path(str(folder).replace("/images", "/labels")) / f"img{k}.txt"
         label.parent.mkdir(parents=True, exist_ok=True)
-        label.write_text(yolo_lines(boxes_of(k)))
+        label.write_text(format_yolo(make_boxes(k)))
     for split, text in zip(pictures, stated, strict=True):
         if text.endswith(".txt"):
             (source / text).parent.mkdir(exist_ok=True)
@@ -54,7 +63,7 @@ def test_yolo_with_splits(
             (source / text).write_text("".join(lines))
     (source / "data.yaml").write_text(DATA_YAML.format(*stated, names))
     train, val = [k for k in range(11) if k not in (3, 4, 8)], [3, 4, 8]
-    check(read(source, "yolo"), train + val)
+    assert_boxes(read_samples(source, "yolo"), train + val)
     content = find_format(source).content(source, Options())
     assert content.split == {"train": [(0, 700_000_000)], "val": [(800_000_000, 1_000_000_000)]}
 
@@ -66,10 +75,10 @@ def test_yolo_without_splits(classes: str, beside: bool, tmp_path: Path) -> None
     for k in range(11):
         write_picture(tmp_path / "images" / f"{k}.png", k)
         folder = tmp_path / ("images" if beside else "labels")
-        (folder / f"{k}.txt").write_text(yolo_lines(boxes_of(k)))
+        (folder / f"{k}.txt").write_text(format_yolo(make_boxes(k)))
     (tmp_path / classes).write_text("drone\nquad copter\n")
-    samples = read(tmp_path, "yolo")
-    check(samples, list(range(11)))
+    samples = read_samples(tmp_path, "yolo")
+    assert_boxes(samples, list(range(11)))
     assert not find_format(tmp_path).content(tmp_path, Options()).split
 
 
@@ -81,15 +90,15 @@ def test_yolo_as_supervision_writes_it(tmp_path: Path) -> None:
     for k in range(6):
         write_picture(tmp_path / "from" / f"{k}.png", k)
         paths.append(str(tmp_path / "from" / f"{k}.png"))
-        boxes = np.array([box for _, box in boxes_of(k)], np.float32).reshape(-1, 4)
+        boxes = np.array([box for _, box in make_boxes(k)], np.float32).reshape(-1, 4)
         numbers = np.arange(len(boxes))
         annotations[paths[-1]] = sv.Detections(xyxy=boxes, class_id=numbers)
     made = sv.DetectionDataset(["drone", "quad copter"], paths, annotations)
     out = tmp_path / "set"
     made.as_yolo(str(out / "images"), str(out / "labels"), str(out / "data.yaml"))
-    check(read(out, "yolo"), list(range(6)))
+    assert_boxes(read_samples(out, "yolo"), list(range(6)))
     made.as_coco(str(out / "c/images"), str(out / "c/annotations/all.json"))
-    check(read(out / "c", "coco"), list(range(6)))
+    assert_boxes(read_samples(out / "c", "coco"), list(range(6)))
 
 
 @pytest.mark.parametrize(
@@ -101,18 +110,18 @@ def test_yolo_as_supervision_writes_it(tmp_path: Path) -> None:
     ],
 )
 def test_confidences_and_polygons_give_boxes(
-    line: str, box: tuple[float, ...], small: Path
+    line: str, box: tuple[float, ...], yolo_set: Path
 ) -> None:
-    (small / "labels/1.txt").write_text(line + "\n\n")
-    (peer,) = labels_of(read(small, "yolo"))[0]
+    (yolo_set / "labels/1.txt").write_text(line + "\n\n")
+    (peer,) = find_labels(read_samples(yolo_set, "yolo"))[0]
     want = np.array(box) * (WIDTH, HEIGHT, WIDTH, HEIGHT)
     np.testing.assert_allclose(peer["box_px"], want)
 
 
-def test_keypoints_are_ignored_where_they_are_stated(small: Path) -> None:
-    (small / "labels/1.txt").write_text("0 0.5 0.5 0.25 0.5 0.4 0.4 2 0.6 0.6 2\n")
-    (small / "data.yaml").write_text("names: [drone]\nkpt_shape: [2, 3]\n")
-    (peer,) = labels_of(read(small, "yolo"))[0]
+def test_keypoints_are_ignored_where_they_are_stated(yolo_set: Path) -> None:
+    (yolo_set / "labels/1.txt").write_text("0 0.5 0.5 0.25 0.5 0.4 0.4 2 0.6 0.6 2\n")
+    (yolo_set / "data.yaml").write_text("names: [drone]\nkpt_shape: [2, 3]\n")
+    (peer,) = find_labels(read_samples(yolo_set, "yolo"))[0]
     assert peer["box_px"] == [120, 56, 200, 168]
 
 
@@ -122,51 +131,54 @@ def test_keypoints_are_ignored_where_they_are_stated(small: Path) -> None:
         "0 0.5 0.5 0.25",
         "0 160 112 40 30",
         "drone 0.5 0.5 0.1 0.1",
-        "0.93 0.5 0.5 0.1 0.1",  # a confidence first
+        "0.93 0.5 0.5 0.1 0.1",  # the confidence comes first
         "0 0.5 0.5 0 0.1",
         "0 nan 0.5 0.1 0.1",
         "0 0.1 0.2 0.5 0.2 0.3 0.7 0.4",
-        "0 0.5 0.5 0.25 0.5 0.87 1",  # a confidence and a track
-        "0 0.5 0.5 0.25 0.5 0.4 0.4 2 0.6 0.6 2",  # keypoints, but nothing says so
+        "0 0.5 0.5 0.25 0.5 0.87 1",  # a confidence and a track number
+        "0 0.5 0.5 0.25 0.5 0.4 0.4 2 0.6 0.6 2",  # keypoints that data.yaml does not state
         "\xff",
     ],
 )
-def test_a_label_file_that_is_broken_leaves_its_picture(line: str, small: Path) -> None:
-    (small / "labels/1.txt").write_bytes(f"0 0.5 0.5 0.1 0.1\n{line}\n".encode("latin-1"))
+def test_a_label_file_that_is_broken_leaves_its_picture(line: str, yolo_set: Path) -> None:
+    (yolo_set / "labels/1.txt").write_bytes(f"0 0.5 0.5 0.1 0.1\n{line}\n".encode("latin-1"))
     with count_left_out() as counted:
-        samples = read(small, "yolo")
+        samples = read_samples(yolo_set, "yolo")
     assert sum(s.message == "CompressedImage" for s in samples) == 2
-    check(samples, [2])
+    assert_boxes(samples, [2])
     (count,) = counted.counts.values()
     assert count == 1
     assert "1.txt" in next(iter(counted.first.values()))
 
 
-def test_a_huge_label_file_leaves_its_picture(small: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (small / "labels/1.txt").write_bytes(bytes(2_000))
+def test_a_huge_label_file_leaves_its_picture(
+    yolo_set: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (yolo_set / "labels/1.txt").write_bytes(bytes(2_000))
     monkeypatch.setattr(limits, "TEXT_BYTES", 1_000)
     with count_left_out() as counted:
-        check(read(small, "yolo"), [2])
+        assert_boxes(read_samples(yolo_set, "yolo"), [2])
     assert "Split it" in next(iter(counted.first.values()))
 
 
-def test_a_set_in_pixels_is_refused(small: Path) -> None:
+def test_a_set_in_pixels_is_refused(yolo_set: Path) -> None:
     for k in (1, 2):
-        (small / f"labels/{k}.txt").write_text("0 160 112 40 30\n")
+        (yolo_set / f"labels/{k}.txt").write_text("0 160 112 40 30\n")
     with pytest.raises(SourceError, match=r"no label file is YOLO's"), count_left_out():
-        read(small, "yolo")
+        read_samples(yolo_set, "yolo")
 
 
 @pytest.mark.parametrize("unlabelled", [False, True])
 def test_image_without_label_file_is_empty_unless_unlabelled_is_set(
-    unlabelled: bool, small: Path, capsys: pytest.CaptureFixture[str]
+    unlabelled: bool, yolo_set: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    write_picture(small / "images/0.png", 0)
-    write_picture(small / "images/._0.png", 0)
-    (small / "labels/7.txt").write_text(yolo_lines(boxes_of(1)))
+    write_picture(yolo_set / "images/0.png", 0)
+    write_picture(yolo_set / "images/._0.png", 0)
+    (yolo_set / "labels/7.txt").write_text(format_yolo(make_boxes(1)))
     with count_left_out() as counted:
-        check(
-            read(small, "yolo", Options(unlabelled=unlabelled)), [1, 2] if unlabelled else [0, 1, 2]
+        assert_boxes(
+            read_samples(yolo_set, "yolo", Options(unlabelled=unlabelled)),
+            [1, 2] if unlabelled else [0, 1, 2],
         )
     assert counted.counts == {"label files without a picture": 1}
     assert ("1 pictures have no label file" in capsys.readouterr().err) != unlabelled
@@ -184,18 +196,20 @@ def test_image_without_label_file_is_empty_unless_unlabelled_is_set(
         "!!python/object/apply:os.system [ls]",
     ],
 )
-def test_invalid_description_gives_one_line_error(text: str, small: Path) -> None:
-    (small / "data.yaml").write_text(text)
+def test_invalid_description_gives_one_line_error(text: str, yolo_set: Path) -> None:
+    (yolo_set / "data.yaml").write_text(text)
     with pytest.raises(SourceError, match=r"data\.yaml does not describe a YOLO set: .*Fix") as e:
-        read(small, "yolo")
+        read_samples(yolo_set, "yolo")
     assert "\n" not in str(e.value)
 
 
-def test_a_picture_of_another_size_follows_the_crop(small: Path) -> None:
+def test_a_picture_of_another_size_follows_the_crop(yolo_set: Path) -> None:
     for peers, k in zip(
-        labels_of(read(small, "yolo", Options(size_px=(160, 112)))), (1, 2), strict=True
+        find_labels(read_samples(yolo_set, "yolo", Options(size_px=(160, 112)))),
+        (1, 2),
+        strict=True,
     ):
-        for peer, (_, box) in zip(peers, boxes_of(k), strict=True):
+        for peer, (_, box) in zip(peers, make_boxes(k), strict=True):
             np.testing.assert_allclose(peer["box_px"], np.array(box) / 2, atol=0.01)
 
 
@@ -203,8 +217,8 @@ def test_a_picture_of_another_size_follows_the_crop(small: Path) -> None:
 def test_label_files_beside_the_pictures_are_enough(folder: str, tmp_path: Path) -> None:
     for k in range(5):
         write_picture(tmp_path / f"{folder}{k}.png", k)
-        (tmp_path / f"{folder}{k}.txt").write_text(yolo_lines(boxes_of(k)))
-    found = labels_of(read(tmp_path, "yolo"))
+        (tmp_path / f"{folder}{k}.txt").write_text(format_yolo(make_boxes(k)))
+    found = find_labels(read_samples(tmp_path, "yolo"))
     assert [[peer["peer"] for peer in peers] for peers in found] == [
         [f"class{n}" for n in range(k % 3)] for k in range(5)
     ]

@@ -1,3 +1,5 @@
+"""The published LocaNet set: labels, frames and errors."""
+
 from collections.abc import Callable
 from itertools import product
 from pathlib import Path
@@ -17,7 +19,7 @@ LABEL = "./dataset/synImgs/{:04d}.jpg 0.1,-0.2 132,137,1000,0\n"
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """Three pictures, one robot each; two train, one test."""
+    """Return a set of three images with one robot each; two are for training, one for testing."""
     inner = tmp_path / "set" / "synImgs"
     inner.mkdir(parents=True)
     jpeg = encode_jpeg(np.zeros((224, 320, 3), np.uint8))
@@ -47,7 +49,7 @@ def test_a_picture_has_its_rows_from_every_file(folder: Path) -> None:
     np.testing.assert_array_equal(first.published, [[132, 137, 1.0]])
 
 
-def test_the_inner_folder_does_too(folder: Path) -> None:
+def test_inner_folder_of_a_set_is_read_too(folder: Path) -> None:
     assert len(locanet.load_images(folder / "synImgs")) == 3
     assert locanet.can_read(folder) and locanet.can_read(folder / "synImgs")
     assert not locanet.can_read(folder.parent)
@@ -75,9 +77,8 @@ def test_the_robot_does_not_see_itself(folder: Path) -> None:
 
 
 def test_the_position_is_turned_by_the_whole_published_rotation(folder: Path) -> None:
-    # Roll only and pitch only, drawn by hand: rolled right side down, what is straight
-    # ahead and to the camera's left is higher than the camera; nose down, what is straight
-    # ahead is lower.
+    # The first two results were derived by hand. With the right side down, a point ahead and to
+    # the left is higher than the camera. With the nose down, a point straight ahead is lower.
     inner = folder / "synImgs"
     lines = ["0.3,0.0 1,1,0,0,0,0", "0.0,0.3 1,0,0,0,0,0", "0.3,-0.2 1,0.5,0.2,0,0,0"]
     text = "".join(f"p/{k:04d}.jpg {line}\n" for k, line in enumerate(lines))
@@ -128,7 +129,7 @@ def test_true_projections_lie_in_the_middle_of_the_boxes(data: Path) -> None:
 
 @pytest.mark.heavy
 def test_only_the_unnegated_attitudes_fit_the_outlines(data: Path) -> None:
-    """The boxes show how robots are tilted in the picture, hence every sign at once."""
+    """Among all signs of the angles, only the stored ones fit the edges of the boxes."""
     images = locanet.load_images(data / "locanet-synthetic")
     edges = PUBLISHED_RENDER.width_px, PUBLISHED_RENDER.height_px
     whole = [i for i in images if (i.box_px[0, :2] > 0).all() and (i.box_px[0, 2:] < edges).all()]
@@ -143,7 +144,10 @@ def test_only_the_unnegated_attitudes_fit_the_outlines(data: Path) -> None:
 
 
 def _box_error(item: locanet.LocanetImage, signs: tuple[int, ...]) -> float:
-    """Median error of the four edges for a rough outline of the published model."""
+    """Return the median error of a box's four edges, pixels, for these signs of the angles.
+
+    The edges are those of a rough outline of the published robot model.
+    """
     roll, pitch, yaw = item.attitude_rad[0]
     camera = _rx(signs[0] * item.roll_rad) @ _ry(signs[1] * item.pitch_rad)
     robot = _rx(signs[2] * roll) @ _rz(yaw) @ _ry(signs[3] * pitch)
@@ -153,8 +157,8 @@ def _box_error(item: locanet.LocanetImage, signs: tuple[int, ...]) -> float:
     return float(np.median(np.abs(np.concatenate([uv.min(0), uv.max(0)]) - item.box_px[0])))
 
 
-def _outline() -> Array:
-    """Rotor rims, feet and body of a Crazyflie twice life size."""
+def _make_outline() -> Array:
+    """Return (N, 3) points on rotors, feet and body of a Crazyflie of twice its size, metres."""
     points = [[x, y, -0.019] for x in (-0.04, 0.04) for y in (-0.04, 0.04)]
     for arm in np.pi / 4 + np.arange(4) * np.pi / 2:
         x, y = 0.107 * np.cos(arm), 0.107 * np.sin(arm)
@@ -166,21 +170,26 @@ def _outline() -> Array:
 
 
 def _rx(a: float) -> Array:
+    """Return the (3, 3) rotation about x, radians."""
     return np.array([[1, 0, 0], [0, np.cos(a), -np.sin(a)], [0, np.sin(a), np.cos(a)]])
 
 
 def _ry(a: float) -> Array:
+    """Return the (3, 3) rotation about y, radians."""
     return np.array([[np.cos(a), 0, np.sin(a)], [0, 1, 0], [-np.sin(a), 0, np.cos(a)]])
 
 
 def _rz(a: float) -> Array:
+    """Return the (3, 3) rotation about z, radians."""
     return np.array([[np.cos(a), -np.sin(a), 0], [np.sin(a), np.cos(a), 0], [0, 0, 1]])
 
 
-OUTLINE = _outline()
+OUTLINE = _make_outline()
 
 
 def _spoil(name: str, line: int, text: str) -> Callable[[Path], None]:
+    """Return a function that replaces a line, counted from 1, of a file of the set."""
+
     def spoil(inner: Path) -> None:
         lines = (inner / name).read_text().splitlines()
         lines[line - 1] = text
@@ -190,6 +199,7 @@ def _spoil(name: str, line: int, text: str) -> Callable[[Path], None]:
 
 
 def _remove(name: str) -> Callable[[Path], None]:
+    """Return a function that removes a file of the set."""
     return lambda inner: (inner / name).unlink()
 
 
@@ -266,7 +276,7 @@ def test_boxes_end_at_the_picture_s_edges() -> None:
 def test_published_two_angle_attitude_is_converted_to_zyx() -> None:
     for roll, pitch in ((0.3, 0.0), (0.0, -0.2), (0.3, -0.2), (-0.1, 0.25)):
         found = locanet.to_attitude_zyx(roll, pitch)
-        up = (_rx(roll) @ _ry(pitch)).T @ [0, 0, 1]  # seen from the camera
+        up = (_rx(roll) @ _ry(pitch)).T @ [0, 0, 1]  # the vertical in the camera frame
         assert camera_from_horizontal(*found) @ [0, 0, 1] == pytest.approx(up)
 
 

@@ -1,3 +1,5 @@
+"""Published ranges of TIERS become ranges, odometry and true positions."""
+
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +12,10 @@ from dmrl.formats.published import tiers
 
 @pytest.fixture
 def ranges(tmp_path: Path) -> Path:
-    """Two robots, one that drives along x at 1 m/s and looks along y; one range is missing."""
+    """Write ranges of two robots; the first moves along x at 1 m/s and faces along y.
+
+    One of the ranges is 0, hence missing.
+    """
     path = tmp_path / "two.npz"
     along = np.arange(10) * 0.1
     still = np.zeros(10)

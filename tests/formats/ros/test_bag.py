@@ -1,3 +1,5 @@
+"""ROS bags: formats, times, and the assignment of topics to robots."""
+
 from collections import Counter
 from pathlib import Path
 from types import SimpleNamespace
@@ -9,29 +11,27 @@ from dmrl import topics
 from dmrl.errors import SourceError
 from dmrl.formats.base import Options
 from dmrl.formats.registry import find_format
-from dmrl.formats.ros import bag as ros
+from dmrl.formats.ros import write_bag as ros
 from dmrl.images.bayer import demosaic
 from dmrl.images.codec import decode
 from dmrl.samples.sample import Sample
 from dmrl.terminal.left_out import count_left_out
 
 from .. import foreign
+from ..reading import group_by_topic
 from . import ros_writer
 
 
-def bag(kind: str, folder: Path) -> Path:
-    """One bag of each kind."""
+def write_bag(kind: str, folder: Path) -> Path:
+    """Write a bag of a kind; return its path."""
     if kind == "ros1":
-        return foreign.ros1_bag(folder / "flight.bag")
-    return foreign.ros2_bag(folder / "flight", kind)
+        return foreign.write_ros1_bag(folder / "flight.bag")
+    return foreign.write_ros2_bag(folder / "flight", kind)
 
 
-def samples(source: Path, options: Options | None = None) -> dict[str, list[Sample]]:
-    """Samples by topic."""
-    found: dict[str, list[Sample]] = {}
-    for sample in ros.load_content(source, options or Options()).samples:
-        found.setdefault(sample.topic, []).append(sample)
-    return found
+def read_samples(source: Path, options: Options | None = None) -> dict[str, list[Sample]]:
+    """Return the samples of a bag by topic."""
+    return group_by_topic(ros.load_content(source, options or Options()).samples)
 
 
 @pytest.mark.parametrize("kind", ["sqlite3", "mcap", "ros1"])
@@ -39,9 +39,9 @@ def samples(source: Path, options: Options | None = None) -> dict[str, list[Samp
 def test_bags_of_every_kind_give_the_same(
     kind: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    source = bag(kind, tmp_path)
+    source = write_bag(kind, tmp_path)
     assert find_format(source).name == "rosbag2"
-    found = samples(source)
+    found = read_samples(source)
     assert {topic: len(v) for topic, v in found.items()} == dict.fromkeys(
         [
             "/cf1/attitude",
@@ -59,13 +59,13 @@ def test_bags_of_every_kind_give_the_same(
     assert found["/cf1/velocity"][0].fields["vx_mps"] == 1.0
     assert found["/cf1/attitude"][0].fields["yaw_rate_radps"] == pytest.approx(0.2)
     pixels = decode(found["/cf1/camera/image"][0].fields["data"])
-    np.testing.assert_array_equal(pixels, demosaic(foreign.pictures(1)[0]))
+    np.testing.assert_array_equal(pixels, demosaic(foreign.make_raw_images(1)[0]))
     assert "left out: messages on /chatter: std_msgs/msg/String" in capsys.readouterr().err
 
 
 @pytest.mark.heavy
 def test_receive_time_becomes_publish_time(tmp_path: Path) -> None:
-    found = samples(foreign.ros2_bag(tmp_path / "flight", late_ns=7_000_000))
+    found = read_samples(foreign.write_ros2_bag(tmp_path / "flight", late_ns=7_000_000))
     for topic in ("/cf1/height", "/cf1/range/cf2", "/cf1/camera/image"):
         assert [s.time_ns for s in found[topic]] == [10**12 + k * 10**8 for k in range(5)]
         received = [s.publish_ns or 0 for s in found[topic]]
@@ -85,7 +85,7 @@ def test_receive_time_becomes_publish_time(tmp_path: Path) -> None:
 def test_motions_in_frames_whose_z_is_down_are_left_out(
     parent: str, child: str, down: bool
 ) -> None:
-    held = ros_writer.odometry(1)
+    held = ros_writer.make_odometry(1)
     held.header.frame_id, held.child_frame_id = parent, child
     line = ros.TopicPlan("/cf1/odom", ros.ODOMETRY, 1, "cf1")
     where = ros.MessageContext(Path("bag"), "cf1")
@@ -97,15 +97,15 @@ def test_motions_in_frames_whose_z_is_down_are_left_out(
 @pytest.mark.heavy
 def test_zero_stamps_are_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     late_ns = 48 * 86_400 * 10**9
-    source = foreign.ros2_bag(tmp_path / "flight", late_ns=late_ns, ranges_stamped=False)
-    found = samples(source)
+    source = foreign.write_ros2_bag(tmp_path / "flight", late_ns=late_ns, ranges_stamped=False)
+    found = read_samples(source)
     assert found["/cf1/range/cf2"][0].time_ns == 10**12 + late_ns
     assert "get the bag's times: 5 on /uwb/cf1/cf2/distance" in capsys.readouterr().err
 
 
 @pytest.mark.heavy
-def test_robots_are_named_as_the_user_wants(tmp_path: Path) -> None:
-    found = samples(bag("sqlite3", tmp_path), Options(names={"cf1": "a", "cf2": "b"}))
+def test_robots_get_the_given_names(tmp_path: Path) -> None:
+    found = read_samples(write_bag("sqlite3", tmp_path), Options(names={"cf1": "a", "cf2": "b"}))
     assert "/a/range/b" in found and "/a/attitude" in found
 
 
@@ -115,7 +115,7 @@ def test_bag_without_known_topics_gives_one_line_error(tmp_path: Path) -> None:
     path = tmp_path / "a.db3"
     path.write_bytes(b"SQLite format 3\0" + b"\0" * 100)
     with pytest.raises(SourceError, match="cannot be read as a ROS bag") as e:
-        samples(path)
+        read_samples(path)
     assert "\n" not in str(e.value)
 
 
@@ -146,21 +146,19 @@ RANGE, ODOMETRY, IMU = (
 POSE, TWIST = "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/TwistStamped"
 
 
-def planned(
-    *held: tuple[str, str, int], **names: str
-) -> tuple[dict[str, tuple[str, str]], list[str]]:
-    """Robot and peer of each topic that is taken, and what is left out."""
+def plan(*held: tuple[str, str, int], **names: str) -> tuple[dict[str, tuple[str, str]], list[str]]:
+    """Return robot and peer of each topic that is converted, and the topics that are not."""
     lines, why = ros.plan_topics(list(held), Options(robot="me", names=names))
     found = {line.topic: (line.robot, line.peer) for line in lines.values()}
     return found, [topic for topic, _ in why]
 
 
 def test_topics_are_assigned_to_robots() -> None:
-    found, unknown = planned(
+    found, unknown = plan(
         ("/cf1/uwb/cf2/range", RANGE, 5),
         ("/imu/data", IMU, 5),
         ("/drone 3/odom", ODOMETRY, 5),
-        ("/cf1/uwb", RANGE, 5),  # to whom?
+        ("/cf1/uwb", RANGE, 5),  # no peer is named
         ("/cf1/cf1/range", RANGE, 5),
         ("/cf9/odom", ODOMETRY, 0),
         (topics.MASKS.format(robot="cf1"), "sensor_msgs/msg/Image", 5),
@@ -188,9 +186,9 @@ def test_topics_are_assigned_to_robots() -> None:
 )
 def test_a_command_is_no_measurement_unless_the_user_says_so(command: str, kind: str) -> None:
     measured = "/mavros/local_position/measured"
-    assert planned((command, kind, 9), (measured, kind, 5))[1] == [command]
+    assert plan((command, kind, 9), (measured, kind, 5))[1] == [command]
     pattern = topics.POSE if kind == POSE else topics.VELOCITY
-    found, unknown = planned((command, kind, 9), **{command: pattern.format(robot="cf1")})
+    found, unknown = plan((command, kind, 9), **{command: pattern.format(robot="cf1")})
     assert found == {command: ("cf1", "")} and not unknown
 
 
@@ -201,13 +199,13 @@ def test_a_command_is_no_measurement_unless_the_user_says_so(command: str, kind:
         *((part, POSE) for part in ("vision_pose", "raw_data", "front_camera")),
     ],
 )
-def test_a_name_of_content_is_no_robot(part: str, kind: str) -> None:
-    found, _ = planned(("/drone/imu", IMU, 5), (f"/drone/{part}", kind, 5))
+def test_topic_part_that_names_its_content_is_not_a_robot(part: str, kind: str) -> None:
+    found, _ = plan(("/drone/imu", IMU, 5), (f"/drone/{part}", kind, 5))
     assert {robot for robot, _ in found.values()} == {"drone"}
 
 
 def test_a_velocity_of_the_body_comes_before_a_longer_one_of_the_map() -> None:
-    found, unknown = planned(
+    found, unknown = plan(
         ("/mavros/local_position/velocity_local", TWIST, 9),
         ("/mavros/local_position/velocity_body", TWIST, 5),
     )
@@ -216,17 +214,17 @@ def test_a_velocity_of_the_body_comes_before_a_longer_one_of_the_map() -> None:
 
 def test_a_pose_of_motion_capture_is_kept_beside_another_of_the_robot() -> None:
     kind = "geometry_msgs/msg/PoseStamped"
-    found, unknown = planned(
+    found, unknown = plan(
         ("/cf1/pose", kind, 5), ("/vrpn_client_node/cf1/pose", kind, 9), ("/vio/cf1/pose", kind, 5)
     )
     assert found.keys() == {"/cf1/pose", "/vrpn_client_node/cf1/pose"}
-    assert unknown == ["/vio/cf1/pose"]  # as long as the first, and after it
+    assert unknown == ["/vio/cf1/pose"]  # as many messages as the first one
 
 
 @pytest.mark.heavy
 def test_expected_message_count_is_an_estimate_per_topic(tmp_path: Path) -> None:
-    content = ros.load_content(bag("sqlite3", tmp_path), Options())
-    with_odometry = 4  # of one message come attitude, velocity, height and pose
+    content = ros.load_content(write_bag("sqlite3", tmp_path), Options())
+    with_odometry = 4  # a message becomes attitude, velocity, height and pose
     assert content.total == len(list(content.samples)) - 5 * (with_odometry - 1)
 
 
@@ -235,13 +233,13 @@ def test_ranges_of_both_directions_and_our_own_messages_are_all_kept() -> None:
     held = [
         ("/cf1/uwb/cf2/range", RANGE, 5),
         ("/cf2/uwb/cf1/range", RANGE, 9),
-        ("/far/cf1/uwb/cf2/range", RANGE, 5),  # no more than the first
+        ("/far/cf1/uwb/cf2/range", RANGE, 5),  # as many messages as the first one
         ("/cf1/height", ours, 1),
         ("/cf2/height", ours, 2),
         ("/cf1/odom", ODOMETRY, 2),
         ("/cf1/imu", IMU, 3),
     ]
-    found, unknown = planned(*held)
+    found, unknown = plan(*held)
     assert found == {
         "/cf1/uwb/cf2/range": ("cf1", "cf2"),
         "/cf2/uwb/cf1/range": ("cf2", "cf1"),

@@ -1,4 +1,4 @@
-"""Files of a rosbag2 folder that rosbags would pass over."""
+"""Files of a rosbag2 folder that rosbags ignores: SQLite's log, and files not in the metadata."""
 
 import shutil
 import sqlite3
@@ -13,15 +13,16 @@ from dmrl.formats.ros.bag import load_content
 from dmrl.terminal.left_out import count_left_out
 
 from . import ros_writer as ros
-from .ros_writer import Sent, times
+from .ros_writer import Sent, make_times
 
 pytestmark = pytest.mark.heavy
 
 
 @pytest.fixture
 def bag(tmp_path: Path) -> Path:
-    sent = [Sent("/cf1/odom", t, ros.odometry(t)) for t in times(3)]
-    return ros.write(tmp_path / "bag", sent, "sqlite3")
+    """Return a bag of three odometry messages."""
+    sent = [Sent("/cf1/odom", t, ros.make_odometry(t)) for t in make_times(3)]
+    return ros.write_bag(tmp_path / "bag", sent, "sqlite3")
 
 
 def test_messages_in_the_log_of_sqlite_are_not_lost(bag: Path) -> None:
@@ -30,7 +31,8 @@ def test_messages_in_the_log_of_sqlite_are_not_lost(bag: Path) -> None:
     writer.execute("PRAGMA journal_mode=WAL")
     writer.execute("INSERT INTO messages SELECT NULL, topic_id, timestamp + 1, data FROM messages")
     writer.commit()
-    copy = shutil.copytree(bag, bag.with_name("copy"))  # as after a crash: it was never closed
+    # The copy has the state after a crash, because the database is still open.
+    copy = shutil.copytree(bag, bag.with_name("copy"))
     writer.close()
     with pytest.raises(SourceError, match=r"bag\.db3-wal has messages that are not yet in bag\.db"):
         load_content(copy, Options())

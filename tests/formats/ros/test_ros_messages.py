@@ -26,7 +26,7 @@ from dmrl.images.codec import decode, encode_jpeg, encode_png
 from dmrl.samples.sample import Sample
 from dmrl.terminal.left_out import count_left_out
 
-from .ros_writer import camera_info
+from .ros_writer import make_camera_info
 
 QUARTER = np.pi / 2
 
@@ -34,11 +34,11 @@ QUARTER = np.pi / 2
 @pytest.mark.parametrize(
     ("angles", "body", "level"),
     [
-        ((QUARTER, 0, 0), (0, 1, 0), (0, 0, 1)),  # rolled to the right, its left is up
+        ((QUARTER, 0, 0), (0, 1, 0), (0, 0, 1)),  # rolled to the right: its left side is up
         ((0, QUARTER, 0), (1, 0, 0), (0, 0, -1)),  # nose down
         ((QUARTER, QUARTER, 0), (0, 1, 0), (1, 0, 0)),
         ((QUARTER, QUARTER, 0), (0, 0, 1), (0, -1, 0)),
-        ((0, 0, QUARTER), (1, 0, 0), (1, 0, 0)),  # its heading changes nothing here
+        ((0, 0, QUARTER), (1, 0, 0), (1, 0, 0)),  # the heading has no effect
     ],
 )
 def test_a_tilted_robot_s_vectors_are_levelled(
@@ -49,7 +49,7 @@ def test_a_tilted_robot_s_vectors_are_levelled(
 
 
 def test_a_fixed_frame_s_vectors_are_turned_by_the_heading() -> None:
-    left = np.array([0.3, -0.2, QUARTER])  # whatever the tilt
+    left = np.array([0.3, -0.2, QUARTER])  # the tilt has no effect
     ahead, up = np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0])
     assert _rotate_from_fixed(ahead, left) == pytest.approx(np.array([1.0, 0.0, 0.0]), abs=1e-12)
     right = np.array([1.0, 0.0, 0.0])
@@ -58,11 +58,12 @@ def test_a_fixed_frame_s_vectors_are_turned_by_the_heading() -> None:
 
 
 def xyzw(*values: float) -> SimpleNamespace:
+    """Return a message with the fields x, y, z and, for four values, w."""
     return SimpleNamespace(**dict(zip("xyzw", values, strict=False)))
 
 
-def given(kind: str, message: object, **where: Any) -> list[Sample]:
-    """Samples of a message of cf1."""
+def convert(kind: str, message: object, **where: Any) -> list[Sample]:
+    """Return the samples of a message of cf1."""
     placed = MessageContext(Path("bag"), "cf1", **where)
     return list(CONVERTERS[kind](message, 1_500_000_000, placed))
 
@@ -71,8 +72,8 @@ TILT = (0.3, -0.2, 0.5)
 TURN = xyzw(*euler_to_quaternion(np.array([TILT]))[0])
 
 
-def odometry(child: str, linear: tuple[float, ...]) -> SimpleNamespace:
-    """Where it is, how it is turned, and how it moves and turns, in the frame ``child``."""
+def make_odometry(child: str, linear: tuple[float, ...]) -> SimpleNamespace:
+    """Return an Odometry with a velocity in the frame ``child``, m/s."""
     twist = SimpleNamespace(linear=xyzw(*linear), angular=xyzw(0.1, 0.2, 0.4))
     held = SimpleNamespace(position=xyzw(1.0, 2.0, 3.0), orientation=TURN)
     return SimpleNamespace(
@@ -84,7 +85,7 @@ def odometry(child: str, linear: tuple[float, ...]) -> SimpleNamespace:
 
 
 def test_odometry_in_the_body_frame_is_levelled() -> None:
-    found = given("nav_msgs/msg/Odometry", odometry("cf1/base_link", (1.0, 2.0, 3.0)))
+    found = convert("nav_msgs/msg/Odometry", make_odometry("cf1/base_link", (1.0, 2.0, 3.0)))
     pose, height, attitude, velocity = found
     assert [s.topic for s in found] == [
         "/cf1/pose",
@@ -96,7 +97,7 @@ def test_odometry_in_the_body_frame_is_levelled() -> None:
     assert pose.fields["pose"]["orientation"] == vars(TURN)
     assert pose.fields["timestamp"] == {"seconds": 1, "nanos": 500_000_000}
     assert height.fields == {"height_m": 3.0}
-    # What turns the yaw is what the gyroscope has about the vertical, over how the robot leans.
+    # The yaw rate is the angular velocity about the vertical, divided by the cosine of the pitch.
     rate = (0.2 * np.sin(0.3) + 0.4 * np.cos(0.3)) / np.cos(-0.2)
     assert tuple(attitude.fields.values()) == pytest.approx((*TILT, rate))
     level = _rotate_from_body(np.array([1.0, 2.0, 3.0]), np.array(TILT))
@@ -106,7 +107,7 @@ def test_odometry_in_the_body_frame_is_levelled() -> None:
 
 @pytest.mark.parametrize("child", ["odom", "cf1/world", "map", "earth"])
 def test_odometry_in_a_fixed_frame_is_turned_by_the_yaw(child: str) -> None:
-    *_, attitude, velocity = given("nav_msgs/msg/Odometry", odometry(child, (1.0, 2.0, 3.0)))
+    *_, attitude, velocity = convert("nav_msgs/msg/Odometry", make_odometry(child, (1.0, 2.0, 3.0)))
     assert attitude.fields["yaw_rate_radps"] == 0.4
     c, s = np.cos(0.5), np.sin(0.5)
     wanted = (c + 2 * s, -s + 2 * c, 3.0)
@@ -124,17 +125,17 @@ def test_imu_and_twist_are_used_without_odometry(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     imu = SimpleNamespace(orientation=TURN, angular_velocity=xyzw(0.1, 0.2, 0.4))
-    (attitude,) = given("sensor_msgs/msg/Imu", imu)
+    (attitude,) = convert("sensor_msgs/msg/Imu", imu)
     rate = (0.2 * np.sin(0.3) + 0.4 * np.cos(0.3)) / np.cos(-0.2)
     assert tuple(attitude.fields.values()) == pytest.approx((*TILT, rate))
     twist = SimpleNamespace(linear=xyzw(1.0, 2.0, 3.0))
     moved = SimpleNamespace(twist=twist, header=SimpleNamespace(frame_id="cf1"))
-    (velocity,) = given("geometry_msgs/msg/TwistStamped", moved)
+    (velocity,) = convert("geometry_msgs/msg/TwistStamped", moved)
     assert tuple(velocity.fields.values()) == (1.0, 2.0, 3.0)
-    assert not given("sensor_msgs/msg/Imu", imu, odometry=True)
-    assert not given("geometry_msgs/msg/TwistStamped", moved, odometry=True)
+    assert not convert("sensor_msgs/msg/Imu", imu, odometry=True)
+    assert not convert("geometry_msgs/msg/TwistStamped", moved, odometry=True)
     moved.header.frame_id = "cf1/odom"
-    assert not given("geometry_msgs/msg/TwistStamped", moved)
+    assert not convert("geometry_msgs/msg/TwistStamped", moved)
     assert (
         "velocities of cf1 in a frame that does not turn with the robot: 1"
         in capsys.readouterr().err
@@ -143,7 +144,7 @@ def test_imu_and_twist_are_used_without_odometry(
 
 @pytest.mark.parametrize(("range_m", "count"), [(0.0, 0), (0.01, 1), (59.99, 1), (60.0, 0)])
 def test_ranges_are_over_0_and_under_60_m(range_m: float, count: int) -> None:
-    found = given("sensor_msgs/msg/Range", SimpleNamespace(range=range_m), peer="cf2")
+    found = convert("sensor_msgs/msg/Range", SimpleNamespace(range=range_m), peer="cf2")
     assert [(s.topic, s.fields) for s in found] == [
         ("/cf1/range/cf2", {"range_m": range_m}),
     ] * count
@@ -154,36 +155,36 @@ def test_ranges_outside_their_own_limits_are_left_out(
     limits: tuple[float, float], count: int
 ) -> None:
     told = SimpleNamespace(range=1.0, min_range=limits[0], max_range=limits[1])
-    assert len(given("sensor_msgs/msg/Range", told, peer="cf2")) == count
+    assert len(convert("sensor_msgs/msg/Range", told, peer="cf2")) == count
 
 
 @pytest.mark.parametrize("what", ["orientation", "angular_velocity"])
-def test_what_an_imu_does_not_measure_is_no_attitude(
+def test_imu_without_orientation_or_rates_gives_no_attitude(
     what: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     level = {"orientation": xyzw(0.0, 0.0, 0.0, 1.0), "angular_velocity": xyzw(0.0, 0.0, 0.0)}
     for first, count in ((0.0, 1), (-1.0, 0)):
         covariance = {f"{what}_covariance": np.array([first, *[0.0] * 8])}
         imu = SimpleNamespace(**level, **covariance)
-        assert len(given("sensor_msgs/msg/Imu", imu)) == count
+        assert len(convert("sensor_msgs/msg/Imu", imu)) == count
     assert f"IMU messages of cf1 without {what.replace('_', ' ')}: 1" in capsys.readouterr().err
 
 
-def test_motion_capture_s_poses_are_true() -> None:
+def test_poses_of_motion_capture_are_written_as_truth() -> None:
     held = SimpleNamespace(pose=SimpleNamespace(position=xyzw(1, 2, 3), orientation=TURN))
     kind = "geometry_msgs/msg/PoseStamped"
-    assert [s.topic for s in given(kind, held)] == ["/cf1/pose"]
-    assert [s.topic for s in given(kind, held, captured=True)] == ["/cf1/pose/truth"]
+    assert [s.topic for s in convert(kind, held)] == ["/cf1/pose"]
+    assert [s.topic for s in convert(kind, held, captured=True)] == ["/cf1/pose/truth"]
 
 
 @pytest.mark.parametrize("names", ["kpdr", "KPDR"])
-def test_a_camera_s_centre_moves_by_half_a_pixel(names: str) -> None:
+def test_principal_point_moves_by_half_a_pixel(names: str) -> None:
     k, p = np.array([7.0, *range(1, 9)]), np.arange(12.0)
     values = (k, p, [0.1, 0.2], np.eye(3).ravel())
     told = SimpleNamespace(
         **dict(zip(names, values, strict=True)), width=64, height=48, distortion_model="plumb_bob"
     )
-    (found,) = given("sensor_msgs/msg/CameraInfo", told)
+    (found,) = convert("sensor_msgs/msg/CameraInfo", told)
     assert found.topic == "/cf1/camera/calibration"
     assert found.fields["K"] == [7, 1, 2.5, 3, 4, 5.5, 6, 7, 8]
     assert found.fields["P"] == [0, 1, 2.5, 3, 4, 5, 6.5, 7, 8, 9, 10, 11]
@@ -191,38 +192,40 @@ def test_a_camera_s_centre_moves_by_half_a_pixel(names: str) -> None:
     assert found.fields["R"] == np.eye(3).ravel().tolist()
     assert (found.fields["width"], found.fields["height"]) == (64, 48)
     assert found.fields["timestamp"] == {"seconds": 1, "nanos": 500_000_000}
-    assert k[2] == 2  # what was given stays as it was
+    assert k[2] == 2  # the message is not modified
 
 
 @pytest.mark.parametrize(("rectified", "fx", "cx"), [(False, 200, 90), (True, 180, 91.5)])
 def test_a_calibration_is_of_the_part_the_binning_and_the_rectification_of_its_images(
     fx: float, cx: float, *, rectified: bool
 ) -> None:
-    told = camera_info(1_500_000_000, 400.0)
+    told = make_camera_info(1_500_000_000, 400.0)
     told.k[:] = [400, 0, 279.5, 0, 400, 239.5, 0, 0, 1]
     told.p[:] = [360, 0, 282.5, 0, 0, 360, 239.5, 0, 0, 0, 1, 0]
     told.width, told.height, told.binning_x, told.binning_y = 640, 480, 2, 2
     told.d = np.array([0.1, 0.0, 0.0, 0.0, 0.0])
     told.roi.x_offset, told.roi.y_offset, told.roi.width, told.roi.height = 100, 40, 400, 300
-    (found,) = given("sensor_msgs/msg/CameraInfo", told, rectified=rectified)
+    (found,) = convert("sensor_msgs/msg/CameraInfo", told, rectified=rectified)
     assert (found.fields["width"], found.fields["height"]) == (200, 150)
     assert found.fields["K"] == [fx, 0, cx, 0, fx, 100, 0, 0, 1]
     assert found.fields["D"] == ([] if rectified else [0.1, 0, 0, 0, 0])
 
 
-def frames(*stamps: tuple[int, int]) -> SimpleNamespace:
-    def one(sec: int, nanosec: int) -> SimpleNamespace:
+def make_transforms(*stamps: tuple[int, int]) -> SimpleNamespace:
+    """Return a TFMessage with a transform for each stamp, seconds and nanoseconds."""
+
+    def make_transform(sec: int, nanosec: int) -> SimpleNamespace:
         stamp = SimpleNamespace(sec=sec, nanosec=nanosec)
         held = SimpleNamespace(translation=xyzw(1, 2, 3), rotation=TURN)
         header = SimpleNamespace(stamp=stamp, frame_id="world")
         return SimpleNamespace(header=header, child_frame_id="cf1", transform=held)
 
-    return SimpleNamespace(transforms=[one(*stamp) for stamp in stamps])
+    return SimpleNamespace(transforms=[make_transform(*stamp) for stamp in stamps])
 
 
 @pytest.mark.parametrize(("stamp", "time_ns"), [((2, 5), 2_000_000_005), ((0, 0), 1_500_000_000)])
 def test_transforms_use_their_stamp_or_receive_time(stamp: tuple[int, int], time_ns: int) -> None:
-    (found,) = given("tf2_msgs/msg/TFMessage", frames(stamp))
+    (found,) = convert("tf2_msgs/msg/TFMessage", make_transforms(stamp))
     assert found.time_ns == time_ns
     (entry,) = found.fields["transforms"]
     assert entry["translation"] == {"x": 1, "y": 2, "z": 3}
@@ -231,8 +234,8 @@ def test_transforms_use_their_stamp_or_receive_time(stamp: tuple[int, int], time
     assert entry["timestamp"] == {"seconds": stamp[0], "nanos": stamp[1]}
 
 
-def picture(encoding: str, channels: int, spare: int = 0) -> SimpleNamespace:
-    """5 x 4 pixels, each byte its number in its row and 16 times the row."""
+def make_image(encoding: str, channels: int, spare: int = 0) -> SimpleNamespace:
+    """Return an Image of 5 x 4 pixels whose byte n of row v is n + 32 v."""
     step = 5 * channels + spare
     rows = np.arange(step)[None] + 32 * np.arange(4)[:, None]
     data = rows.astype(np.uint8).ravel()
@@ -250,12 +253,10 @@ def picture(encoding: str, channels: int, spare: int = 0) -> SimpleNamespace:
         ({"encoding": "32FC1"}, "images of encoding '32FC1', which is not supported"),
     ],
 )
-def test_pictures_that_cannot_be_are_left_out_and_counted(
-    change: dict[str, Any], reason: str
-) -> None:
+def test_invalid_images_are_left_out_and_counted(change: dict[str, Any], reason: str) -> None:
     with count_left_out() as counted:
-        assert not given(
-            "sensor_msgs/msg/Image", SimpleNamespace(**vars(picture("rgb8", 3)) | change)
+        assert not convert(
+            "sensor_msgs/msg/Image", SimpleNamespace(**vars(make_image("rgb8", 3)) | change)
         )
     assert counted.counts == {reason: 1}
 
@@ -276,7 +277,7 @@ def test_vectors_and_rates_are_turned_as_the_robot_is(
     c, s = np.cos(yaw), np.sin(yaw)
     heading = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
     assert _rotate_from_fixed(heading @ level, angles) == pytest.approx(level)
-    turn = camera_from_horizontal(roll, pitch) @ [0, 0, 0.7]  # a steady turn about the vertical
+    turn = camera_from_horizontal(roll, pitch) @ [0, 0, 0.7]  # about the vertical
     assert _compute_yaw_rate(turn, angles) == pytest.approx(0.7)
     (quaternion,) = euler_to_quaternion(angles[None])
     assert _to_euler(xyzw(*quaternion)) == pytest.approx(angles, abs=1e-6)
@@ -301,17 +302,17 @@ def test_fixed_frames_are_recognized_by_name(frame: str, parent: str, fixed: boo
 
 def test_imu_without_orientation_gives_no_attitude() -> None:
     lost = SimpleNamespace(orientation=xyzw(0, 0, 0, 0), angular_velocity=xyzw(0.1, 0.2, 0.4))
-    assert given("sensor_msgs/msg/Imu", lost) == []
-    held = odometry("base", (1.0, 2.0, 3.0))
+    assert convert("sensor_msgs/msg/Imu", lost) == []
+    held = make_odometry("base", (1.0, 2.0, 3.0))
     held.pose.pose.orientation = lost.orientation
-    assert [s.message for s in given("nav_msgs/msg/Odometry", held)] == ["Height"]
+    assert [s.message for s in convert("nav_msgs/msg/Odometry", held)] == ["Height"]
 
 
 def test_compressed_pictures_keep_their_bytes() -> None:
     rgb = np.full((8, 8, 3), 90, np.uint8)
     for data, kind in ((encode_png(rgb), "png"), (encode_jpeg(rgb), "jpeg")):
         message = SimpleNamespace(data=np.frombuffer(data, np.uint8), format=kind)
-        (found,) = given("sensor_msgs/msg/CompressedImage", message)
+        (found,) = convert("sensor_msgs/msg/CompressedImage", message)
         assert (found.topic, found.time_ns) == ("/cf1/camera/image", 1_500_000_000)
         assert (found.fields["data"], found.fields["format"]) == (data, kind)
 
@@ -322,7 +323,7 @@ def test_compressed_pictures_of_other_formats_become_png(kind: str) -> None:
     buffer = BytesIO()
     PIL.Image.fromarray(rgb).save(buffer, kind, lossless=True)
     message = SimpleNamespace(data=np.frombuffer(buffer.getvalue(), np.uint8), format=kind.lower())
-    (found,) = given("sensor_msgs/msg/CompressedImage", message)
+    (found,) = convert("sensor_msgs/msg/CompressedImage", message)
     assert found.fields["format"] == "png"
     assert decode(found.fields["data"]).tolist() == rgb.tolist()
 
@@ -333,12 +334,12 @@ def test_compressed_pictures_of_other_formats_become_png(kind: str) -> None:
 def test_a_video_and_a_cut_picture_are_left_out(data: bytes) -> None:
     message = SimpleNamespace(data=np.frombuffer(data, np.uint8), format="h264")
     with count_left_out() as counted:
-        assert not given("sensor_msgs/msg/CompressedImage", message)
+        assert not convert("sensor_msgs/msg/CompressedImage", message)
     assert counted.counts == {"images that cannot be decoded, of format 'h264'": 1}
 
 
 def test_image_goes_to_the_robot_of_its_topic() -> None:
-    (found,) = given("sensor_msgs/msg/Image", picture("rgb8", 3))
+    (found,) = convert("sensor_msgs/msg/Image", make_image("rgb8", 3))
     assert (found.topic, found.time_ns) == ("/cf1/camera/image", 1_500_000_000)
     v, u, k = np.meshgrid(np.arange(4), np.arange(5), np.arange(3), indexing="ij")
     assert decode(found.fields["data"]).tolist() == (32 * v + 3 * u + k).tolist()

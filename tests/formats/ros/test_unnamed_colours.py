@@ -1,4 +1,4 @@
-"""Images of ROS whose encoding or format says how their colours are stored."""
+"""Colours of ROS images whose encoding or format does not name the channels."""
 
 from pathlib import Path
 from types import SimpleNamespace
@@ -11,17 +11,18 @@ from dmrl.images.bayer import to_bayer
 from dmrl.images.codec import decode, encode_jpeg, encode_png
 from dmrl.samples.sample import Sample
 
-from .ros_writer import camera_info
+from .ros_writer import make_camera_info
 
 SCENE = np.full((24, 32, 3), (200, 90, 30), np.uint8)
 
 
 def convert(kind: str, message: object) -> tuple[list[Sample], MessageContext]:
+    """Return the samples of a message of cf1, and its context after the conversion."""
     where = MessageContext(Path("bag"), "cf1")
     return list(CONVERTERS[kind](message, 1_500_000_000, where)), where
 
 
-def test_channels_without_names_are_opencv_s_and_said() -> None:
+def test_unnamed_channels_are_read_as_bgr_and_reported() -> None:
     message = SimpleNamespace(
         height=24, width=32, encoding="8UC3", step=96, is_bigendian=0, data=SCENE[..., ::-1].ravel()
     )
@@ -43,7 +44,7 @@ def test_a_compressed_raw_picture_gets_its_colours(kind: str) -> None:
 
 
 def test_a_calibration_may_have_k_alone() -> None:
-    message = camera_info(1_500_000_000, 100.0)
+    message = make_camera_info(1_500_000_000, 100.0)
     full, _ = convert("sensor_msgs/msg/CameraInfo", message)
     message.p = message.r = np.zeros(0)
     assert convert("sensor_msgs/msg/CameraInfo", message)[0] == full
