@@ -1,4 +1,4 @@
-"""A small labelled flight for training: bright squares on dark noise."""
+"""A small labelled flight, with models and a dataset, for fast tests of training."""
 
 from pathlib import Path
 
@@ -21,7 +21,10 @@ STEP_NS = 100_000_000
 
 @pytest.fixture(scope="session")
 def dots(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Thirty images of 64 x 48 px at 10 Hz, twenty for training; attitude in between."""
+    """Return thirty labelled images of 64 x 48 px at 10 Hz, twenty of them for training.
+
+    A peer is a bright square on dark noise. The attitude of the robot follows each image.
+    """
     path = tmp_path_factory.mktemp("dots") / "dots.mcap"
     rng = np.random.default_rng(0)
     split = {"train": f"[[0, {19 * STEP_NS}]]", "test": f"[[{20 * STEP_NS}, {29 * STEP_NS}]]"}
@@ -43,7 +46,7 @@ def dots(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run folder with an untrained network."""
+    """Return the folder of an untrained network."""
     folder = tmp_path_factory.mktemp("model")
     save_model(Model(build_network("locanet", seed=1).eval(), "locanet", threshold=0.4), folder)
     return folder
@@ -51,23 +54,26 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def dots_dataset(dots: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The dataset of the small flight."""
+    """Return the dataset of `dots`."""
     out = tmp_path_factory.mktemp("dots-dataset") / "dots"
     dataset.run([dots], out, dataset.Settings())
     return out
 
 
 @pytest.fixture(scope="session", params=["locanet", "dmrl-nano"])
-def settled(
+def random_model(
     request: pytest.FixtureRequest, dots_dataset: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> Path:
-    """A run folder with random weights and normalisations that know the small flight."""
+    """Return the folder of a network with random weights.
+
+    The batch normalisations have the statistics of the images of `dots`.
+    """
     network = build_network(request.param, seed=1).train()
     images = np.concatenate(open_dataset(dots_dataset).split("train").pixels)
     seen = normalize_images(torch.from_numpy(images).permute(0, 3, 1, 2))
     for norm in network.modules():
         if isinstance(norm, torch.nn.BatchNorm2d):
-            norm.momentum = 1.0  # what it keeps is what it saw last
+            norm.momentum = 1.0  # keep the statistics of the last batch only
     with torch.no_grad():
         for parameter in network.parameters():
             parameter += 0.3 * torch.randn(parameter.shape, generator=torch.manual_seed(2))
@@ -79,18 +85,20 @@ def settled(
 
 
 @pytest.fixture(scope="session")
-def quantised(settled: Path, dots_dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The int8 form of ``settled``."""
-    out = tmp_path_factory.mktemp("quantised") / settled.name
+def quantised_model(
+    random_model: Path, dots_dataset: Path, tmp_path_factory: pytest.TempPathFactory
+) -> Path:
+    """Return the int8 form of `random_model`."""
+    out = tmp_path_factory.mktemp("quantised") / random_model.name
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(quantization_report, "plots", None)
-        quantize.run(settled, dots_dataset, out, quantize.Settings())
+        quantize.run(random_model, dots_dataset, out, quantize.Settings())
     return out
 
 
 @pytest.fixture(scope="session")
 def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Thirty seconds of two robots with good sensors; cf1 has a camera."""
+    """Return a flight of two robots over 30 s with calibrated sensors; cf1 has a camera."""
     out = tmp_path_factory.mktemp("label") / "flight.mcap"
     settings = fly.Settings(
         2, 30.0, noise="calibrated", seed=1001, camera=True, cameras_max=1, camera_rate_hz=2.0

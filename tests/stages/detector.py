@@ -1,4 +1,4 @@
-"""Detections of a network on a simulated flight, without rendering its images."""
+"""Simulated detections on a simulated flight, without rendering its images."""
 
 from pathlib import Path
 
@@ -22,18 +22,20 @@ def with_detections(
     tilt: tuple[NDArray[np.int64], Array, Array] | None = None,
     rate_hz: float = RATE_HZ,
 ) -> Path:
-    """The flight with ``robot``'s detections; ``camera`` took the images, AIDECK is on record.
+    """Copy a flight and add detections of ``robot``; return the path of the copy.
 
-    Pixels are off by 3 px, depths by 15 % and, for a second or so, by another 8 %; one image in
-    six shows nobody; one in four has a false alarm. The camera tilts as ``tilt`` says, times,
-    roll and pitch; without it, as the log does.
+    Errors have standard deviations of 3 px, of 15 % of the depth, and of another 8 % that lasts
+    about a second. One detection in six is missed, and one image in four has a false alarm.
+
+    ``camera`` takes the images, but the recorded calibration is that of the AI deck. ``tilt`` holds
+    times in nanoseconds, roll and pitch in radians of the camera; without it, those of the log.
     """
     rng = np.random.default_rng(seed)
     held = read_summary(flight)
     span_ns = held.start_ns, held.end_ns
     times_ns = np.arange(span_ns[0] + 10**9, span_ns[1] - 10**9, round(1e9 / rate_hz))
     taken_ns = times_ns - round(camera.delay_s * 1e9)
-    at_ns, *tilted = tilt or _logged(flight, robot)
+    at_ns, *tilted = tilt or _read_tilt(flight, robot)
     roll, pitch = (np.interp(taken_ns, at_ns, angle) for angle in tilted)
     found: list[list[dict[str, float]]] = [[] for _ in times_ns]
     for topic in held.topics:
@@ -49,11 +51,11 @@ def with_detections(
         depth_m = depth_m * np.exp(lasting + rng.normal(0, 0.15, len(uv)))
         uv = uv + rng.normal(0, 3.0, uv.shape)
         for k in np.flatnonzero(shown):
-            found[k].append(_detection(uv[k, 0], uv[k, 1], depth_m[k], rng.uniform(0.5, 1.0)))
+            found[k].append(_make_detection(uv[k, 0], uv[k, 1], depth_m[k], rng.uniform(0.5, 1.0)))
     for entries in found:
         if rng.random() < 0.25:
             u, v = rng.uniform((0, 0), (320, 224))
-            entries.append(_detection(u, v, rng.uniform(0.3, 4.0), rng.uniform(0.4, 0.7)))
+            entries.append(_make_detection(u, v, rng.uniform(0.3, 4.0), rng.uniform(0.4, 0.7)))
         entries.sort(key=lambda d: -d["confidence"])
     with RecordingWriter(out, Provenance("test")) as sink:
         for raw in read_raw(flight):
@@ -69,13 +71,17 @@ def with_detections(
     return out
 
 
-def _logged(flight: Path, robot: str) -> tuple[NDArray[np.int64], Array, Array]:
+def _read_tilt(flight: Path, robot: str) -> tuple[NDArray[np.int64], Array, Array]:
+    """Return times in nanoseconds, roll and pitch in radians of a robot's log."""
     table = read_table(flight, topics.ATTITUDE(robot))
     columns = (table[name].to_numpy() for name in ("log_time", "roll_rad", "pitch_rad"))
     times_ns, roll, pitch = columns
     return times_ns, roll, pitch
 
 
-def _detection(u_px: float, v_px: float, depth_m: float, confidence: float) -> dict[str, float]:
+def _make_detection(
+    u_px: float, v_px: float, depth_m: float, confidence: float
+) -> dict[str, float]:
+    """Return the fields of a detection."""
     values = {"u_px": u_px, "v_px": v_px, "depth_m": depth_m, "confidence": confidence}
     return {name: float(value) for name, value in values.items()}

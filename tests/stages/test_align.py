@@ -1,3 +1,5 @@
+"""`dmrl align` by ranges and by steady image rates."""
+
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -21,7 +23,7 @@ from dmrl.stages.align import METADATA, Settings, run
 
 @pytest.fixture
 def recording(tmp_path: Path) -> Path:
-    """A minute of two robots; cf2's clock is 80 ms ahead, 20 ppm fast, and 30 s late."""
+    """Return ranges of two robots over a minute; cf2's clock is off by -29.92 s and 20 ppm fast."""
     path, rng = tmp_path / "in.mcap", np.random.default_rng(0)
     time = np.cumsum(rng.uniform(0.03, 0.05, 1500))
     measured = 3 + 0.5 * np.sin(time) + 0.4 * np.sin(1.7 * time) + rng.normal(0, 0.05, len(time))
@@ -60,7 +62,7 @@ def test_all_of_a_robot_is_set_by_the_other_s_clock(recording: Path, tmp_path: P
     assert not [f for f in check(out) if f.level == "error" and "image" not in f.topic]
 
 
-def test_a_robot_that_would_begin_before_zero_takes_all_with_it(
+def test_all_robots_are_shifted_if_one_would_begin_before_zero(
     recording: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "out.mcap"
@@ -75,7 +77,7 @@ def test_a_robot_that_would_begin_before_zero_takes_all_with_it(
 def test_times_stay_where_no_robot_would_begin_before_zero(
     recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """cf1's clock is behind by 30 s: its times move back, and begin at 10 s still."""
+    """Only cf1's times are moved, by 30 s to about 10 s. That is after zero."""
     late = tmp_path / "late.mcap"
     with RecordingWriter(late, build_provenance("test")) as sink:
         sink.write(10**9, "/cf2/height", message_class("Height")())

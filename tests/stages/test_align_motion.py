@@ -20,19 +20,19 @@ OFFSET_S, DRIFT = 0.080, 20e-6
 WIDTH_PX, HEIGHT_PX, FOCAL_PX = 160, 112, 92.0
 
 
-def wrong_in(duration_s: float) -> Wrong:
-    """A clock that is 80 ms ahead in the middle, and 20 ppm fast."""
+def make_wrong_clock(duration_s: float) -> Wrong:
+    """Return a clock that is 80 ms ahead in the middle of a flight and runs 20 ppm fast."""
     return lambda time_s: time_s + OFFSET_S + DRIFT * (time_s - duration_s / 2)
 
 
-def worst_s(before: Path, after: Path, topic: str) -> float:
-    """How far the times of a topic are from those of the recording before it was spoilt."""
+def find_worst_error_s(before: Path, after: Path, topic: str) -> float:
+    """Return the largest difference of a topic's times in two recordings, seconds."""
     old, new = (read_table(p, topic, fields=[])["log_time"].to_numpy() for p in (before, after))
     return float(np.abs(old - new).max() * 1e-9)
 
 
-def panorama() -> np.ndarray:
-    """All around, with things of all sizes, (224, 1024) grey."""
+def make_panorama() -> np.ndarray:
+    """Return a (224, 1024) grey panorama with structure of all sizes."""
     rng, scene = np.random.default_rng(5), np.zeros((224, 1024))
     for size in (4, 8, 16, 32):
         coarse = rng.normal(size=(224 // size, 1024 // size))
@@ -40,9 +40,12 @@ def panorama() -> np.ndarray:
     return np.asarray(128 + 30 * scene)
 
 
-def looked_around(path: Path, duration_s: float, wrong: Wrong, rate_hz: float) -> None:
-    """A drone that turns; its camera, dim in the corners and noisy, has a clock of its own."""
-    rng, scene = np.random.default_rng(1), panorama()
+def write_turning_camera(path: Path, duration_s: float, wrong: Wrong, rate_hz: float) -> None:
+    """Write a drone that yaws, and the images of its camera with the times of a wrong clock.
+
+    The images are noisy and darker in the corners.
+    """
+    rng, scene = np.random.default_rng(1), make_panorama()
     waves = [(rng.uniform(0.1, 0.3), rng.uniform(0.3, 3), rng.uniform(0, 6)) for _ in range(6)]
     row, col = np.mgrid[:HEIGHT_PX, :WIDTH_PX]
     dim = 1 - 0.4 * np.hypot(row / HEIGHT_PX - 0.5, col / WIDTH_PX - 0.5) ** 2
@@ -74,13 +77,14 @@ def looked_around(path: Path, duration_s: float, wrong: Wrong, rate_hz: float) -
             sink.write(round(wrong(time_s) * 1e9), "/cf1/camera/image", picture)
 
 
-def camera_error_s(folder: Path, duration_s: float) -> float:
+def measure_camera_error_s(folder: Path, duration_s: float) -> float:
+    """Align a camera by its images; return the largest error of its times, seconds."""
     spoilt, out = folder / "in.mcap", folder / "out.mcap"
-    looked_around(spoilt, duration_s, wrong_in(duration_s), 20.0)
+    write_turning_camera(spoilt, duration_s, make_wrong_clock(duration_s), 20.0)
     clocks = run(spoilt, out, Settings(cameras=True))
     assert list(clocks) == ["cf1/camera"]
     assert clocks["cf1/camera"].by == "yaw rate"
-    assert worst_s(spoilt, out, "/cf1/attitude") == 0
+    assert find_worst_error_s(spoilt, out, "/cf1/attitude") == 0
     times = read_table(out, "/cf1/camera/image", fields=[])["log_time"].to_numpy()
     true = 1e9 * (1 + np.arange(len(times)) / 20.0)
     (told,) = read_summary(out).metadata[METADATA]
@@ -90,19 +94,19 @@ def camera_error_s(folder: Path, duration_s: float) -> float:
 
 @pytest.mark.heavy
 def test_a_camera_is_set_by_the_turns_it_saw(tmp_path: Path) -> None:
-    assert camera_error_s(tmp_path, 40.0) < 0.005
+    assert measure_camera_error_s(tmp_path, 40.0) < 0.005
 
 
 @pytest.mark.slow
 def test_a_camera_is_set_to_5_ms_over_5_minutes(tmp_path: Path) -> None:
-    assert camera_error_s(tmp_path, 300.0) < 0.005
+    assert measure_camera_error_s(tmp_path, 300.0) < 0.005
 
 
-def mocap_errors_s(folder: Path, duration_s: float, noise: Preset) -> list[float]:
-    """By robot, after its log got a wrong clock and was set by motion capture's again."""
+def measure_mocap_errors_s(folder: Path, duration_s: float, noise: Preset) -> list[float]:
+    """Align two robots to motion capture; return the largest error of each, seconds."""
     true, spoilt, out = folder / "true.mcap", folder / "in.mcap", folder / "out.mcap"
     fly.run(true, fly.Settings(duration_s=duration_s, noise=noise, trajectory="random", seed=4))
-    wrong = wrong_in(duration_s)
+    wrong = make_wrong_clock(duration_s)
     with RecordingWriter(spoilt, build_provenance("test")) as sink:
         for raw in read_raw(true):
             is_log = raw.topic.split("/")[-1] in ("attitude", "velocity", "height")
@@ -111,18 +115,18 @@ def mocap_errors_s(folder: Path, duration_s: float, noise: Preset) -> list[float
                 sink.write_raw(replace(raw, time_ns=time_ns))
     clocks = run(spoilt, out, Settings(mocap=True, reference="mocap"))
     assert clocks.keys() == {"mocap", "cf1", "cf2"}
-    assert worst_s(true, out, "/tf") == 0
-    return [worst_s(true, out, f"/{robot}/attitude") for robot in ("cf1", "cf2")]
+    assert find_worst_error_s(true, out, "/tf") == 0
+    return [find_worst_error_s(true, out, f"/{robot}/attitude") for robot in ("cf1", "cf2")]
 
 
 @pytest.mark.heavy
 def test_robots_are_set_by_motion_capture(tmp_path: Path) -> None:
-    assert max(mocap_errors_s(tmp_path, 40.0, "calibrated")) < 0.005
+    assert max(measure_mocap_errors_s(tmp_path, 40.0, "calibrated")) < 0.005
 
 
 @pytest.mark.slow
 def test_robots_are_set_to_5_ms_over_5_minutes_by_motion_capture(tmp_path: Path) -> None:
-    assert max(mocap_errors_s(tmp_path, 300.0, "realistic")) < 0.005
+    assert max(measure_mocap_errors_s(tmp_path, 300.0, "realistic")) < 0.005
 
 
 @pytest.mark.heavy

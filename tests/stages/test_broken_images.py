@@ -32,8 +32,8 @@ BROKEN = {
 }
 
 
-def write(path: Path, broken: bytes, places: tuple[int, ...]) -> Path:
-    """Write six labelled images, of which some are broken."""
+def write_recording(path: Path, broken: bytes, places: tuple[int, ...]) -> Path:
+    """Write six labelled images, those at ``places`` broken."""
     with RecordingWriter(path, Provenance("test")) as sink:
         for k in range(COUNT):
             kind = "png" if k % 2 else "jpeg"
@@ -47,13 +47,14 @@ def write(path: Path, broken: bytes, places: tuple[int, ...]) -> Path:
 
 @pytest.fixture(params=list(BROKEN))
 def broken(request: pytest.FixtureRequest) -> bytes:
+    """Return an image that cannot be decoded."""
     return BROKEN[request.param]
 
 
 @pytest.fixture(params=[0, 3, COUNT - 1])
 def recording(request: pytest.FixtureRequest, broken: bytes, tmp_path: Path) -> Path:
-    """A recording with one broken image: the first, one in the middle, the last."""
-    return write(tmp_path / "in.mcap", broken, (request.param,))
+    """Return a recording whose first, fourth or last image is broken."""
+    return write_recording(tmp_path / "in.mcap", broken, (request.param,))
 
 
 Run = Callable[..., tuple[int, dict[str, Any], str]]
@@ -61,7 +62,10 @@ Run = Callable[..., tuple[int, dict[str, Any], str]]
 
 @pytest.fixture
 def run(capsys: pytest.CaptureFixture[str]) -> Run:
-    """Run a command with --json; return its status, its document and its lines on stderr."""
+    """Return a function that runs a command.
+
+    The function returns exit status, JSON document and standard error.
+    """
 
     def command(*words: object) -> tuple[int, dict[str, Any], str]:
         status = boundary.run_to_status(lambda: app([str(word) for word in words]))
@@ -72,8 +76,8 @@ def run(capsys: pytest.CaptureFixture[str]) -> Run:
     return command
 
 
-def time_of(recording: Path, data: bytes) -> int:
-    """Time of the image with these bytes."""
+def find_time(recording: Path, data: bytes) -> int:
+    """Return the time of the image with these bytes, nanoseconds."""
     (found,) = [s.time_ns for s in read(recording, CAMERA_IMAGE("cf1")) if s.message.data == data]
     return found
 
@@ -85,9 +89,9 @@ def test_predict_skips_broken_images(
     out = tmp_path / "out.mcap"
     rc, told, output = run("predict", model, recording, out, "--json", "--backend", "torch")
     assert (rc, told["images"], told["left_out"]) == (0, COUNT - 1, UNDECODABLE)
-    assert f"at {time_of(recording, broken)} ns" in output
+    assert f"at {find_time(recording, broken)} ns" in output
     times = [raw.time_ns for raw in read_raw(out, "/cf1/detections")]
-    assert sorted({*times, time_of(recording, broken)}) == [k * STEP_NS for k in range(COUNT)]
+    assert sorted({*times, find_time(recording, broken)}) == [k * STEP_NS for k in range(COUNT)]
     assert len(times) == COUNT - 1
     made = read_summary(out).provenance
     assert made is not None and made.left_out == UNDECODABLE
@@ -101,9 +105,9 @@ def test_dataset_skips_broken_images(
 ) -> None:
     rc, told, output = run("dataset", recording, tmp_path / "set", "--json", "--test-share", 0)
     assert (rc, told["left_out"]) == (0, {"cannot be decoded": 1})
-    assert f"at {time_of(recording, broken)} ns" in output
+    assert f"at {find_time(recording, broken)} ns" in output
     times = open_dataset(tmp_path / "set").split("train").table["log_time"].to_pylist()
-    assert sorted({*times, time_of(recording, broken)}) == [k * STEP_NS for k in range(COUNT)]
+    assert sorted({*times, find_time(recording, broken)}) == [k * STEP_NS for k in range(COUNT)]
     assert len(times) == COUNT - 1
     rc, _, output = run("dataset", recording, tmp_path / "no", "--json", "--strict")
     assert rc == 1 and "--strict" in output and not list(tmp_path.glob("no*"))
@@ -112,7 +116,7 @@ def test_dataset_skips_broken_images(
 def test_check_reports_broken_images(run: Run, recording: Path, broken: bytes) -> None:
     rc, told, _ = run("check", recording, "--json")
     texts = [finding["text"] for finding in told["findings"]]
-    wanted = f"1 messages contain no readable image: {time_of(recording, broken)} ns"
+    wanted = f"1 messages contain no readable image: {find_time(recording, broken)} ns"
     assert rc == 1 and wanted in texts
 
 
@@ -120,7 +124,7 @@ def test_view_skips_broken_images(run: Run, recording: Path, broken: bytes, tmp_
     pytest.importorskip("rerun")
     rc, _, output = run("view", recording, "--save", tmp_path / "out.rrd")
     assert rc == 0
-    where = f"{CAMERA_IMAGE('cf1')} at {time_of(recording, broken)} ns"
+    where = f"{CAMERA_IMAGE('cf1')} at {find_time(recording, broken)} ns"
     assert f"left out: images that cannot be decoded: 1 (at {where})" in output
 
 
@@ -137,7 +141,7 @@ def test_evaluate_skips_broken_images(
 def test_only_broken_images_are_an_error(
     run: Run, broken: bytes, model: Path, tmp_path: Path
 ) -> None:
-    recording = write(tmp_path / "in.mcap", broken, tuple(range(COUNT)))
+    recording = write_recording(tmp_path / "in.mcap", broken, tuple(range(COUNT)))
     for words in (("predict", model), ("dataset",), ("view",)):
         out = tmp_path / "out.mcap" if words[0] == "predict" else tmp_path / "out"
         flags = ("--save", tmp_path / "out.rrd") if words[0] == "view" else (out,)
@@ -163,8 +167,8 @@ def test_third_party_recording_with_broken_image_is_processed(
 def test_python_api_raises_one_error_for_broken_images(
     broken: bytes, model: Path, tmp_path: Path
 ) -> None:
-    from dmrl.stages import predict  # noqa: PLC0415 - the command imports it late too
+    from dmrl.stages import predict  # noqa: PLC0415 - needs torch
 
-    recording = write(tmp_path / "in.mcap", broken, tuple(range(COUNT)))
+    recording = write_recording(tmp_path / "in.mcap", broken, tuple(range(COUNT)))
     with pytest.raises(RecordingError, match="no image can be decoded"):
         predict.run(model, recording, tmp_path / "out.mcap", predict.Settings(backend="torch"))

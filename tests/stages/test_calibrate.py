@@ -1,3 +1,5 @@
+"""`dmrl calibrate`: intrinsics from boards, mount and delay from flights."""
+
 from dataclasses import replace
 from pathlib import Path
 
@@ -31,7 +33,7 @@ TILTED = replace(AIDECK, mount_rad=(0.0, float(np.radians(-2.86)), 0.0), delay_s
 
 @pytest.fixture(scope="module")
 def seen(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A flight whose camera is mounted crookedly, and whose images are stamped late."""
+    """Return detections of a camera that is mounted crookedly and stamps its images late."""
     folder = tmp_path_factory.mktemp("calibrate")
     flight = folder / "flight.mcap"
     fly.run(flight, fly.Settings(2, 40.0, noise="calibrated", seed=1001))
@@ -40,13 +42,14 @@ def seen(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def calibrated(seen: Path) -> tuple[Path, calibrate.Result]:
-    """The camera of the flight by its true positions: its file, and what was found."""
+    """Calibrate the camera by true positions; return its file and the result."""
     out = seen.with_name("camera.toml")
     return out, calibrate.run([seen], out, Settings(against="truth"))
 
 
 @pytest.fixture(scope="module")
 def boards(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder of nine images of a calibration board."""
     folder = tmp_path_factory.mktemp("boards")
     rng = np.random.default_rng(0)
     for k in range(9):
@@ -99,7 +102,7 @@ def test_stated_errors_give_the_median_distance_of_detections() -> None:
     assert expected_median_px(matched) == pytest.approx(median, rel=0.03)
 
 
-def test_labels_made_with_it_lie_where_the_peer_was_seen(
+def test_calibration_moves_labels_closer_to_the_detections(
     seen: Path, calibrated: tuple[Path, calibrate.Result], tmp_path: Path
 ) -> None:
     camera, _ = calibrated
@@ -119,11 +122,12 @@ def test_labels_made_with_it_lie_where_the_peer_was_seen(
     }.items():
         out = tmp_path / f"{name}.mcap"
         label.run(with_images, out, settings)
-        distance[name] = _median_px(out)
+        distance[name] = _measure_median_px(out)
     assert distance["calibrated"] < 0.8 * distance["plain"]
 
 
-def _median_px(recording: Path) -> float:
+def _measure_median_px(recording: Path) -> float:
+    """Return the median distance of labels from the nearest detection, pixels."""
     found = {one.time_ns: one.message.detections for one in read(recording, "/cf1/detections")}
     apart = [
         min(np.hypot(d.u_px - peer.u_px, d.v_px - peer.v_px) for d in found[one.time_ns])
@@ -225,8 +229,8 @@ def test_an_existing_output_is_refused(seen: Path, tmp_path: Path) -> None:
         calibrate.run([seen], out, Settings(against="truth"))
 
 
-def _seen(seed: int, folder: Path, camera: Camera) -> Path:
-    """A labelled flight with detections; the camera tilts as the robot did, not as its log says."""
+def _write_labelled_flight(seed: int, folder: Path, camera: Camera) -> Path:
+    """Write a labelled flight with detections; the camera tilts with the true attitude."""
     steps = [folder / f"{seed}-{name}.mcap" for name in ("flight", "labelled", "seen")]
     fly.run(steps[0], fly.Settings(2, 60.0, noise="calibrated", seed=seed))
     label.run(steps[0], steps[1], label.Settings())
@@ -236,8 +240,8 @@ def _seen(seed: int, folder: Path, camera: Camera) -> Path:
     return with_detections(steps[1], steps[2], "cf1", camera, seed, tilt, rate_hz=9.73)
 
 
-def _normalised(sources: list[Path], out: Path, camera: Camera) -> np.ndarray:
-    """(4,) errors over their sigmas: mount and delay from positions that were estimated."""
+def _normalize_errors(sources: list[Path], out: Path, camera: Camera) -> np.ndarray:
+    """Calibrate by estimated positions; return (4,) errors of mount and delay over their sigmas."""
     figures = calibrate.run(sources, out, Settings()).figures
     true = [*np.degrees(camera.mount_rad), 1e3 * camera.delay_s]
     found = np.array([*figures["mount_deg"], figures["delay_ms"]])
@@ -245,8 +249,8 @@ def _normalised(sources: list[Path], out: Path, camera: Camera) -> np.ndarray:
 
 
 def test_sigmas_from_estimated_positions_cover_the_truth(tmp_path: Path) -> None:
-    seen = _seen(4000, tmp_path, CROOKED)
-    assert np.abs(_normalised([seen], tmp_path / "camera.toml", CROOKED)).max() < 3.5
+    seen = _write_labelled_flight(4000, tmp_path, CROOKED)
+    assert np.abs(_normalize_errors([seen], tmp_path / "camera.toml", CROOKED)).max() < 3.5
 
 
 @pytest.mark.slow
@@ -254,30 +258,35 @@ def test_sigmas_from_estimated_positions_cover_the_truth(tmp_path: Path) -> None
 def test_sigmas_of_twenty_flights_hold(tmp_path: Path) -> None:
     squares = np.array(
         [
-            _normalised([_seen(4100 + k, tmp_path, CROOKED)], tmp_path / f"{k}.toml", CROOKED)
+            _normalize_errors(
+                [_write_labelled_flight(4100 + k, tmp_path, CROOKED)],
+                tmp_path / f"{k}.toml",
+                CROOKED,
+            )
             for k in range(20)
         ]
     )
-    # Positions are a little more exact than they say, and so is what stands on them.
+    # Estimated positions overstate their sigmas, and so does this calibration. Hence 0.5.
     high = chi2.ppf(0.975, squares.size) / squares.size
     assert 0.5 < (squares**2).mean() < high
 
 
 @pytest.fixture(scope="module")
-def three(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+def three_flights(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """Return three labelled flights with detections of the same camera."""
     folder = tmp_path_factory.mktemp("three")
-    return [_seen(4200 + k, folder, TILTED) for k in range(3)]
+    return [_write_labelled_flight(4200 + k, folder, TILTED) for k in range(3)]
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(1200)
 @pytest.mark.parametrize("start_s", [0.0, 0.06, 0.2])
 def test_three_flights_give_pitch_and_delay_from_any_start(
-    three: list[Path], start_s: float, tmp_path: Path
+    three_flights: list[Path], start_s: float, tmp_path: Path
 ) -> None:
-    # Estimated positions left pitch off by half, and the delay where it started.
+    # Regression: the pitch was wrong by half, and the delay stayed at its start value.
     begin = tmp_path / "begin.toml"
     begin.write_text(format_camera(replace(AIDECK, delay_s=start_s)), encoding="utf-8")
-    found = calibrate.run(three, tmp_path / "camera.toml", Settings(camera=begin)).camera
+    found = calibrate.run(three_flights, tmp_path / "camera.toml", Settings(camera=begin)).camera
     assert np.degrees(found.mount_rad[1]) == pytest.approx(-2.86, abs=0.8)
     assert found.delay_s == pytest.approx(0.06, abs=0.004)

@@ -1,3 +1,5 @@
+"""`dmrl convert`: outputs, settings and errors."""
+
 import json
 import subprocess
 import sys
@@ -21,7 +23,7 @@ from ..formats import plain_usd
 
 @pytest.fixture
 def pictures(tmp_path: Path) -> Path:
-    """Two labelled pictures."""
+    """Return a folder of two images; the first has a labelled peer, the second none."""
     folder = tmp_path / "pictures"
     folder.mkdir()
     for k in range(2):
@@ -96,7 +98,7 @@ def test_the_published_set_becomes_a_recording(data: Path, tmp_path: Path) -> No
 def test_real_frames_take_the_camera_by_name(data: Path, tmp_path: Path) -> None:
     out = tmp_path / "frames.mcap"
     counts = run(data / "aideck-frames", out, Settings(camera=Path("aideck")))
-    # Two of the four have maps of the chip beside them.
+    # Two of the four images have maps of the chip.
     assert counts == {
         "/cf1/camera/calibration": 1,
         "/cf1/camera/image": 4,
@@ -130,7 +132,7 @@ def test_a_folder_of_pictures_is_not_a_source_each(pictures: Path) -> None:
         find_sources(pictures, None)
 
 
-def test_several_files_are_one_argument_too_many() -> None:
+def test_several_sources_are_a_usage_error() -> None:
     error = UnusedCliTokensError(unused_tokens=["b.jpg", "out.mcap"], command_chain=("convert",))
     words = "dmrl: b.jpg is one argument too many. Try: dmrl convert --help"
     assert str(format_usage_error(error)) == words
@@ -212,19 +214,19 @@ def test_recordings_are_never_overwritten(pictures: Path, tmp_path: Path) -> Non
 def test_the_command_prints_counts_and_exits_by_kind_of_error(
     pictures: Path, tmp_path: Path
 ) -> None:
-    def dmrl(*words: str) -> subprocess.CompletedProcess[str]:
+    def run_dmrl(*words: str) -> subprocess.CompletedProcess[str]:
         return subprocess.run(
             [sys.executable, "-m", "dmrl.cli", "convert", *words], capture_output=True, text=True
         )
 
     out = tmp_path / "out.mcap"
-    done = dmrl(str(pictures), str(out), "--from", "images", "--json")
+    done = run_dmrl(str(pictures), str(out), "--from", "images", "--json")
     assert done.returncode == 0
     assert json.loads(done.stdout)["messages"]["/cf1/camera/image"] == 2
-    again = dmrl(str(pictures), str(out))
+    again = run_dmrl(str(pictures), str(out))
     assert (again.returncode, again.stdout) == (1, "")
     assert again.stderr.startswith("dmrl: ") and again.stderr.count("\n") == 1
-    assert dmrl(str(pictures), str(out), "--rate-hz", "0").returncode == 2
+    assert run_dmrl(str(pictures), str(out), "--rate-hz", "0").returncode == 2
 
 
 def test_empty_file_gives_one_line_error(tmp_path: Path) -> None:
@@ -236,16 +238,16 @@ def test_empty_file_gives_one_line_error(tmp_path: Path) -> None:
 
 @pytest.mark.heavy
 def test_flights_logged_on_micro_sd_can_be_labelled(tmp_path: Path) -> None:
-    """A simulated flight, written as the firmware would log it: take-off frame, degrees."""
+    """The firmware logs in the take-off frame and in degrees."""
     flight = tmp_path / "flight.mcap"
     fly.run(flight, fly.Settings(duration_s=30.0, noise="calibrated"))
     logs = tmp_path / "logs"
     logs.mkdir()
     for robot, number in (("cf1", 2), ("cf2", 1)):
-        (logs / robot).write_bytes(_as_logged(flight, robot, number))
+        (logs / robot).write_bytes(_pack_firmware_log(flight, robot, number))
     made, labelled = tmp_path / "made.mcap", tmp_path / "labelled.mcap"
     run(logs, made, Settings())
-    # The log says again what the flight said, in other units and frames.
+    # The conversion restores units and frames of the simulated flight.
     for topic, fields in (
         ("/cf1/attitude", ("roll_rad", "pitch_rad")),
         ("/cf2/velocity", ("vx_mps", "vy_mps")),
@@ -260,7 +262,8 @@ def test_flights_logged_on_micro_sd_can_be_labelled(tmp_path: Path) -> None:
     assert check(made) == []
 
 
-def _as_logged(flight: Path, robot: str, peer: int) -> bytes:
+def _pack_firmware_log(flight: Path, robot: str, peer: int) -> bytes:
+    """Return the micro-SD log that the firmware would write during a simulated flight."""
     attitude, velocity = (read_table(flight, f"/{robot}/{t}") for t in ("attitude", "velocity"))
     height = read_table(flight, f"/{robot}/height")
     ranges = read_table(flight, f"/{robot}/range/cf{peer}")
@@ -303,7 +306,7 @@ def test_a_recording_is_not_a_source(pictures: Path, tmp_path: Path) -> None:
 
 
 def test_logs_are_written_as_columns(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    # One by one, a message costs some 20 us; frames on /tf, 20 a second, are what is left of that.
+    # Writing a single message costs about 20 us. Only the transforms, 20 a second, are written so.
     variables = [(f"stateEstimate.{name}", "f") for name in ("x", "y", "z", "roll", "pitch", "yaw")]
     rows = [(1, 2000 * k, (0.1, 0.2, 1.0, 1.0, 2.0, 0.1 * k)) for k in range(500)]
     log = tmp_path / "log00"
@@ -311,11 +314,13 @@ def test_logs_are_written_as_columns(tmp_path: Path, monkeypatch: pytest.MonkeyP
     singly: list[str] = []
     write = RecordingWriter.write
 
-    def counted(sink: RecordingWriter, time_ns: int, topic: str, made: object, **rest: int) -> None:
+    def write_counted(
+        sink: RecordingWriter, time_ns: int, topic: str, made: object, **rest: int
+    ) -> None:
         singly.append(topic)
         write(sink, time_ns, topic, made, **rest)
 
-    monkeypatch.setattr(RecordingWriter, "write", counted)
+    monkeypatch.setattr(RecordingWriter, "write", write_counted)
     counts = run(log, tmp_path / "out.mcap", Settings())
     assert set(singly) == {"/tf"}
     assert counts["/cf1/log/state"] == counts["/cf1/attitude"] == counts["/cf1/pose"] == 500

@@ -15,6 +15,7 @@ ROOT = Path(__file__).parents[2]
 
 
 def run_doctor_json(capsys: pytest.CaptureFixture[str]) -> dict[str, dict[str, object]]:
+    """Run ``dmrl doctor --json``; return its parts by name."""
     app(["doctor", "--json"], result_action="return_value")
     return {part["name"]: part for part in json.loads(capsys.readouterr().out)}
 

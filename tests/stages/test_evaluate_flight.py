@@ -1,3 +1,5 @@
+"""`dmrl evaluate` for flights of a pilot."""
+
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,7 +16,7 @@ from dmrl.stages.fly import Flags, Settings
 
 @pytest.fixture(scope="module")
 def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Ten seconds behind a leader that an ideal eye misses in a third of the images."""
+    """Return a flight behind a leader that is missed in a third of the images, 10 s."""
     out = tmp_path_factory.mktemp("flight") / "flight.mcap"
     flags = Flags(duration_s=10.0, eye="ideal", camera=False, seed=2)
     settings = recipes.load("fly_follow", "fly", Settings, flags)
@@ -22,7 +24,8 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def evaluated(path: Path, what: Any = "auto") -> dict[str, Any]:
+def evaluate_flight(path: Path, what: Any = "auto") -> dict[str, Any]:
+    """Return the document of an evaluation."""
     made = evaluate.run([path], None, evaluate.Settings(what=what))
     assert isinstance(made, dict)
     return made
@@ -30,7 +33,7 @@ def evaluated(path: Path, what: Any = "auto") -> dict[str, Any]:
 
 @pytest.mark.heavy
 def test_a_piloted_flight_is_evaluated_over_time(flown: Path) -> None:
-    (one,) = evaluated(flown)["flights"]
+    (one,) = evaluate_flight(flown)["flights"]
     assert (one["robot"], one["peer"]) == ("cf1", "cf2")
     assert one["held_s"] == pytest.approx(10.0, abs=0.1)
     assert one["contacts"] == 0
@@ -43,7 +46,7 @@ def test_a_piloted_flight_is_evaluated_over_time(flown: Path) -> None:
 
 @pytest.mark.heavy
 def test_tracks_of_such_a_flight_are_evaluated_on_request(flown: Path) -> None:
-    assert evaluated(flown, "tracks")["robots"][0]["robot"] == "cf1"
+    assert evaluate_flight(flown, "tracks")["robots"][0]["robot"] == "cf1"
 
 
 def test_flight_without_truth_is_refused(flown: Path, tmp_path: Path) -> None:
@@ -51,4 +54,4 @@ def test_flight_without_truth_is_refused(flown: Path, tmp_path: Path) -> None:
     kept = [t for t in read_summary(flown).topics if not topics.parse_topic(topics.TRUTH, t)]
     trim(flown, short, topics=[t for t in kept if t != "/tf"])
     with pytest.raises(RecordingError, match="no true position"):
-        evaluated(short, "flight")
+        evaluate_flight(short, "flight")

@@ -1,3 +1,5 @@
+"""`dmrl evaluate` for estimated positions."""
+
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -15,24 +17,29 @@ from dmrl.stages.evaluate import Settings, command, run
 Make = Callable[..., Path]
 
 
-def position(x: float, y: float, std_m: float = 0.1, status: int = STATUS_OK) -> object:
+def make_position(x: float, y: float, std_m: float = 0.1, status: int = STATUS_OK) -> object:
+    """Return a PeerPosition in metres with a diagonal covariance."""
     covariance = (np.eye(3) * std_m**2).ravel().tolist()
     return message_class("PeerPosition")(x=x, y=y, covariance=covariance, status=status)
 
 
 @pytest.fixture
 def labelled(tmp_path: Path) -> Path:
-    """Forty seconds: cf1 is 0.1 m off in x, and unsure for ten; cf2 is exact but knows nothing."""
+    """Return positions of two robots over 40 s.
+
+    Those of cf1 have an error of 0.1 m in x and are unconverged for 10 s. Those of cf2 are exact
+    but without covariance.
+    """
     path = tmp_path / "labelled.mcap"
     with RecordingWriter(path, Provenance("test")) as sink:
         for k in range(800):
             at = k * 50_000_000
             for robot, peer in (("cf1", "cf2"), ("cf2", "cf1")):
-                truth = position(1.0 + 0.001 * k, 0.5, 0.0)
+                truth = make_position(1.0 + 0.001 * k, 0.5, 0.0)
                 sink.write(at, f"/{robot}/peer/{peer}/truth", truth)
-            late = at + 25_000_000  # between two truths
+            late = at + 25_000_000  # between two true positions
             status = STATUS_UNCONVERGED if k < 200 else STATUS_OK
-            here = position(1.1 + 0.001 * (k + 0.5), 0.5, status=status)
+            here = make_position(1.1 + 0.001 * (k + 0.5), 0.5, status=status)
             sink.write(late, "/cf1/peer/cf2/position", here)
             unknown = message_class("PeerPosition")(x=1.0 + 0.001 * k, y=0.5)
             sink.write(at, "/cf2/peer/cf1/position", unknown)
@@ -88,9 +95,9 @@ def test_coverage_counts_missing_estimates(
     path = tmp_path / "picked.mcap"
     with RecordingWriter(path, Provenance("test")) as sink:
         for k in range(400):
-            sink.write(k * 10**8, "/cf1/peer/cf2/truth", position(1.0, 0.0, 0.0))
-            if k < 100:  # the good ones
-                sink.write(k * 10**8, "/cf1/peer/cf2/position", position(1.0, 0.0))
+            sink.write(k * 10**8, "/cf1/peer/cf2/truth", make_position(1.0, 0.0, 0.0))
+            if k < 100:  # a quarter of the flight
+                sink.write(k * 10**8, "/cf1/peer/cf2/position", make_position(1.0, 0.0))
     made = run([path], None, Settings())
     assert isinstance(made, dict)
     assert made["overall"]["covered"] == made["pairs"][0]["covered"] == pytest.approx(0.25)
@@ -105,9 +112,9 @@ def test_a_short_flight_settles_in_its_first_half(
     path = tmp_path / "short.mcap"
     with RecordingWriter(path, Provenance("test")) as sink:
         for k in range(121):
-            sink.write(k * 10**8, "/cf1/peer/cf2/truth", position(1.0, 0.0, 0.0))
+            sink.write(k * 10**8, "/cf1/peer/cf2/truth", make_position(1.0, 0.0, 0.0))
             error = 0.5 if k < 60 else 0.1
-            sink.write(k * 10**8, "/cf1/peer/cf2/position", position(1.0 + error, 0.0))
+            sink.write(k * 10**8, "/cf1/peer/cf2/position", make_position(1.0 + error, 0.0))
     made = run([path], None, Settings())
     assert isinstance(made, dict)
     assert made["settle_s"] == 6.0
@@ -123,9 +130,9 @@ def test_truth_is_not_interpolated_over_gaps(tmp_path: Path) -> None:
     path = tmp_path / "gap.mcap"
     with RecordingWriter(path, Provenance("test")) as sink:
         for at_s in (0.0, 0.2, 5.0):
-            sink.write(round(at_s * 1e9), "/cf1/peer/cf2/truth", position(at_s, 0.0, 0.0))
+            sink.write(round(at_s * 1e9), "/cf1/peer/cf2/truth", make_position(at_s, 0.0, 0.0))
         for at_s in (0.1, 0.2, 3.0, 5.0):
-            sink.write(round(at_s * 1e9), "/cf1/peer/cf2/position", position(at_s, 0.0))
+            sink.write(round(at_s * 1e9), "/cf1/peer/cf2/position", make_position(at_s, 0.0))
     (pair,) = positions.judge(path)
     assert pair.judged.error_m == pytest.approx(np.zeros((3, 2)))
     assert pair.without_truth == 1
@@ -134,14 +141,14 @@ def test_truth_is_not_interpolated_over_gaps(tmp_path: Path) -> None:
 def test_recordings_with_nothing_to_judge_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "truth.mcap"
     with RecordingWriter(path, Provenance("test")) as sink:
-        sink.write(0, "/cf1/peer/cf2/truth", position(1, 0, 0.0))
+        sink.write(0, "/cf1/peer/cf2/truth", make_position(1, 0, 0.0))
     with pytest.raises(RecordingError, match=r"has no positions\. Try: dmrl label"):
         run([path], None, Settings(what="positions"))
     with pytest.raises(SettingError, match="positions are judged one recording at a time"):
         run([path, path], None, Settings(what="positions"))
     other = tmp_path / "estimate.mcap"
     with RecordingWriter(other, Provenance("test")) as sink:
-        sink.write(0, "/cf1/peer/cf2/position", position(1, 0))
+        sink.write(0, "/cf1/peer/cf2/position", make_position(1, 0))
     with pytest.raises(RecordingError, match="no true position for any"):
         run([other], None, Settings())
 

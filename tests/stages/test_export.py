@@ -1,3 +1,5 @@
+"""`dmrl export`, and all backends on exported models."""
+
 import json
 from pathlib import Path
 
@@ -18,14 +20,18 @@ INT8 = ("onnx-int8", "integer", "c")
 
 
 @pytest.fixture(scope="session")
-def exported(quantised: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    out = tmp_path_factory.mktemp("exported") / quantised.name
-    run(quantised, out, Settings())
+def exported(quantised_model: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the export of `quantised_model`."""
+    out = tmp_path_factory.mktemp("exported") / quantised_model.name
+    run(quantised_model, out, Settings())
     return out
 
 
-def grids(model: Path, recording: Path, out: Path, backend: str) -> np.ndarray:
-    """(images, confidence and depth, rows, cols) that a backend gives."""
+def predict_grids(model: Path, recording: Path, out: Path, backend: str) -> np.ndarray:
+    """Run a backend on a recording; return its (images, 2, rows, cols) maps.
+
+    Channel 0 is the confidence, channel 1 the depth in metres.
+    """
     file = out / f"{model.parent.name}-{backend}.mcap"
     predict.run(model, recording, file, predict.Settings(backend=backend))
     made = read_summary(file).provenance
@@ -37,30 +43,30 @@ def grids(model: Path, recording: Path, out: Path, backend: str) -> np.ndarray:
 
 
 def test_every_backend_runs_a_quantised_model_and_an_export(
-    quantised: Path, exported: Path, dots: Path, tmp_path: Path
+    quantised_model: Path, exported: Path, dots: Path, tmp_path: Path
 ) -> None:
-    wanted = grids(quantised, dots, tmp_path, "torch")
+    wanted = predict_grids(quantised_model, dots, tmp_path, "torch")
     assert np.ptp(wanted[:, 0]) > 0.1
-    for model in (quantised, exported):
-        onnx = grids(model, dots, tmp_path, "onnx")
+    for model in (quantised_model, exported):
+        onnx = predict_grids(model, dots, tmp_path, "onnx")
         np.testing.assert_allclose(onnx, wanted, rtol=1e-3, atol=1e-4)
-    reference = grids(quantised, dots, tmp_path, "integer")
+    reference = predict_grids(quantised_model, dots, tmp_path, "integer")
     assert 0 < np.abs(reference[:, 0] - wanted[:, 0]).mean() < 0.1
-    np.testing.assert_array_equal(grids(exported, dots, tmp_path, "integer"), reference)
-    np.testing.assert_array_equal(grids(exported, dots, tmp_path, "c"), reference)
-    for model in (quantised, exported):
-        fast = grids(model, dots, tmp_path, "onnx-int8")
-        np.testing.assert_allclose(fast, reference, rtol=1e-5)  # the same levels
+    np.testing.assert_array_equal(predict_grids(exported, dots, tmp_path, "integer"), reference)
+    np.testing.assert_array_equal(predict_grids(exported, dots, tmp_path, "c"), reference)
+    for model in (quantised_model, exported):
+        fast = predict_grids(model, dots, tmp_path, "onnx-int8")
+        np.testing.assert_allclose(fast, reference, rtol=1e-5)  # equal integer levels
 
 
 def test_export_lists_its_files(
-    quantised: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    quantised_model: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "export"
-    app(["export", str(quantised), str(out), "--json"], result_action="return_value")
+    app(["export", str(quantised_model), str(out), "--json"], result_action="return_value")
     output = json.loads(capsys.readouterr().out)
     names = {path.name for path in out.iterdir()}
-    c = quantised.name.replace("-", "_")
+    c = quantised_model.name.replace("-", "_")
     assert output["files"].keys() == names
     assert names >= {"model.onnx", "model.int8.onnx", "integer.npz", f"{c}.c", f"{c}.h"}
     made = json.loads((out / "provenance.json").read_text())
@@ -68,47 +74,47 @@ def test_export_lists_its_files(
 
 
 def test_export_for_small_l1_reports_memory_placement(
-    quantised: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    quantised_model: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     whole, two, none = (tmp_path / name for name in ("whole", "two", "none"))
     said = []
     for out, kb in ((whole, 64), (two, 18)):
-        words = ["export", str(quantised), str(out), "--l1-kb", str(kb), "--json"]
+        words = ["export", str(quantised_model), str(out), "--l1-kb", str(kb), "--json"]
         app(words, result_action="return_value")
         said.append(json.loads(capsys.readouterr().out))
     assert said[0]["far_bytes"] == said[0]["traffic_bytes"] == 0
-    if quantised.name == "dmrl-nano":
+    if quantised_model.name == "dmrl-nano":
         assert said[1]["state_bytes"] <= 10 * 1024 < said[0]["state_bytes"]
         assert min(said[1]["far_bytes"], said[1]["traffic_bytes"]) > 0
     with pytest.raises(SettingError, match="Raise --l1-kb"):
-        run(quantised, none, Settings(l1_kb=9))
+        run(quantised_model, none, Settings(l1_kb=9))
     assert sorted(tmp_path.iterdir()) == [two, whole]
 
 
 def test_a_float_model_becomes_float_onnx_alone(
-    settled: Path, dots: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    random_model: Path, dots: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    written = run(settled, tmp_path / "export", Settings())
+    written = run(random_model, tmp_path / "export", Settings())
     assert {each.name for each in written} == {
         "model.onnx",
         "model.json",
         "provenance.json",
         "README.md",
     }
-    assert f"dmrl quantize {settled} DATASET OUT" in capsys.readouterr().err
-    assert len(grids(tmp_path / "export", dots, tmp_path, "onnx")) == 30
+    assert f"dmrl quantize {random_model} DATASET OUT" in capsys.readouterr().err
+    assert len(predict_grids(tmp_path / "export", dots, tmp_path, "onnx")) == 30
 
 
-def test_same_inputs_same_bytes(quantised: Path, exported: Path, tmp_path: Path) -> None:
-    run(quantised, tmp_path / "again", Settings())
+def test_same_inputs_same_bytes(quantised_model: Path, exported: Path, tmp_path: Path) -> None:
+    run(quantised_model, tmp_path / "again", Settings())
     for path in exported.iterdir():
         assert path.read_bytes() == (tmp_path / "again" / path.name).read_bytes(), path.name
 
 
 @pytest.mark.parametrize("backend", INT8)
-def test_a_float_model_has_no_int8_backend(settled: Path, backend: str) -> None:
+def test_a_float_model_has_no_int8_backend(random_model: Path, backend: str) -> None:
     with pytest.raises(ModelError, match=rf"no int8 network, as --backend {backend} .*quantize"):
-        detector.open_detector(settled, backend)
+        detector.open_detector(random_model, backend)
 
 
 def test_an_export_is_no_model_for_torch(exported: Path, tmp_path: Path) -> None:
@@ -128,14 +134,14 @@ def test_images_of_another_size_are_refused(exported: Path, backend: str) -> Non
 
 
 def test_a_missing_package_is_named_with_its_extra(
-    settled: Path, monkeypatch: pytest.MonkeyPatch
+    random_model: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def absent(name: str) -> None:
+    def fail(name: str) -> None:
         raise ModuleNotFoundError(name="onnxruntime")
 
-    monkeypatch.setattr(detector, "import_module", absent)
+    monkeypatch.setattr(detector, "import_module", fail)
     with pytest.raises(MissingExtra, match=r"onnxruntime.* pip install 'dmrl\[deploy\]'"):
-        detector.open_detector(settled, "onnx")
+        detector.open_detector(random_model, "onnx")
 
 
 @pytest.mark.parametrize("backend", detector.OPENERS)

@@ -1,3 +1,5 @@
+"""`dmrl fly`: topics, frames, recipes and errors."""
+
 import csv
 from dataclasses import replace
 from itertools import pairwise
@@ -23,7 +25,7 @@ SHORT = Settings(duration_s=4.0, seed=3)
 
 @pytest.fixture(scope="module")
 def seen(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Four seconds of three robots; the first two carry a camera."""
+    """Return a flight of three robots over 4 s; the first two carry a camera."""
     out = tmp_path_factory.mktemp("fly") / "seen.mcap"
     fly.run(out, Settings(3, 4.0, noise="harsh", seed=3, camera=True, cameras_max=2))
     return out
@@ -48,7 +50,7 @@ def test_measurements_use_the_clock_of_the_robot(seen: Path) -> None:
     assert np.allclose(table.column("vx_mps").to_numpy(), flight.robots["cf2"].vx_mps)
     times = table.column("log_time").to_numpy().astype(float) * 1e-9
     assert np.allclose(times, 1.0 + flight.robots["cf2"].time_s, atol=1e-8)
-    assert abs(times[0] - 1.0) > 1e-3  # harsh clocks are off
+    assert abs(times[0] - 1.0) > 1e-3  # the clocks of harsh noise have offsets
 
 
 def test_truth_labels_are_projections_of_the_true_positions(seen: Path) -> None:
@@ -62,7 +64,7 @@ def test_truth_labels_are_projections_of_the_true_positions(seen: Path) -> None:
             truth = flight.truth["cf1"]
             roll = np.interp(time_s, truth.time_s, truth.roll)[0]
             pitch = np.interp(time_s, truth.time_s, truth.pitch)[0]
-            # By hand: pitch about y first, then roll about the nose.
+            # Computed by hand: pitch about y first, then roll about x.
             x, z = x * np.cos(pitch) - z * np.sin(pitch), x * np.sin(pitch) + z * np.cos(pitch)
             y, z = y * np.cos(roll) + z * np.sin(roll), -y * np.sin(roll) + z * np.cos(roll)
             assert label.depth_m == pytest.approx(x)
@@ -107,7 +109,7 @@ def test_a_flight_survives_the_way_through_csv(tmp_path: Path) -> None:
     folder.mkdir()
     for robot, log in flight.robots.items():
         ((_, peer),) = [pair for pair in flight.ranges if pair[0] == robot]
-        ranges = dict(_rows_of_ranges(flight.ranges[robot, peer].time_s, log.time_s))
+        ranges = dict(_assign_ranges(flight.ranges[robot, peer].time_s, log.time_s))
         with (folder / f"{robot}.csv").open("w", newline="") as stream:
             writer = csv.writer(stream)
             writer.writerow(["time_s", *LOG_COLUMNS, f"range_{peer}_m"])
@@ -129,8 +131,8 @@ def test_a_flight_survives_the_way_through_csv(tmp_path: Path) -> None:
     assert flown.column("range_m").equals(converted.column("range_m"))
 
 
-def _rows_of_ranges(ranged_s: np.ndarray, logged_s: np.ndarray) -> list[tuple[int, int]]:
-    """(row of the log, number of the range): each range goes with the next row."""
+def _assign_ranges(ranged_s: np.ndarray, logged_s: np.ndarray) -> list[tuple[int, int]]:
+    """Return row of the log and number of each range, which belongs to the next row."""
     rows = np.searchsorted(logged_s, ranged_s)
     assert all(one < other for one, other in pairwise(rows))
     return [(int(row), k) for k, row in enumerate(rows)]
@@ -250,7 +252,9 @@ def test_limits_of_keys_in_a_table_hold(given: str, fault: str, tmp_path: Path) 
 
 
 @pytest.mark.slow
-def test_blender_renders_what_is_labelled_in_one_place(blender: Path, tmp_path: Path) -> None:
+def test_blender_images_of_a_flight_match_their_labels_and_share_a_background(
+    blender: Path, tmp_path: Path
+) -> None:
     drawn = Settings(2, 3.0, seed=0, camera=True, camera_rate_hz=1.0)
     rendered = replace(drawn, camera_renderer="blender", cameras_max=1)
     paths = [tmp_path / f"{name}.mcap" for name in ("drawn", "rendered", "again")]
@@ -270,5 +274,5 @@ def test_blender_renders_what_is_labelled_in_one_place(blender: Path, tmp_path: 
             assert left < label.u_px < right and top < label.v_px < bottom
     assert sum(len(peers[0].box_px) > 0 for peers in found) >= 2
     images = [decode(s.message.data).astype(float) for s in read(paths[1], "/cf1/camera/image")]
-    # The same place: neighbours in time are alike, as backgrounds drawn anew are not.
+    # Consecutive images correlate, because the background stays the same during a flight.
     assert np.corrcoef(images[0].ravel(), images[1].ravel())[0, 1] > 0.7

@@ -1,4 +1,4 @@
-"""Memory of a simulated flight, counted by Python and NumPy."""
+"""Memory of a simulated flight, measured by tracemalloc."""
 
 import tracemalloc
 from pathlib import Path
@@ -9,12 +9,15 @@ from dmrl.stages import fly
 from dmrl.stages.fly import Settings
 
 KB_PER_SECOND = 20
-"""For each robot: seventeen columns of 100 numbers a second are 14, and what makes them 5."""
+"""Allowed for each robot.
+
+Seventeen columns of 100 numbers a second need 14 kB, and computing them another 5 kB.
+"""
 SHORT_S, LONG_S = 10.0, 60.0
 
 
-def _peak(out: Path, settings: Settings) -> int:
-    """The most bytes that were held at a time."""
+def _measure_peak(out: Path, settings: Settings) -> int:
+    """Fly; return the peak of allocated memory, bytes."""
     tracemalloc.start()
     try:
         fly.run(out, settings)
@@ -25,9 +28,9 @@ def _peak(out: Path, settings: Settings) -> int:
 
 @pytest.mark.heavy
 def test_a_flight_holds_its_columns_and_no_message(tmp_path: Path) -> None:
-    fly.run(tmp_path / "first.mcap", Settings(duration_s=2.0))  # loads what is loaded once
+    fly.run(tmp_path / "first.mcap", Settings(duration_s=2.0))  # exclude what is loaded only once
     short, long = (
-        _peak(tmp_path / f"{duration_s}.mcap", Settings(duration_s=duration_s))
+        _measure_peak(tmp_path / f"{duration_s}.mcap", Settings(duration_s=duration_s))
         for duration_s in (SHORT_S, LONG_S)
     )
     assert (long - short) / (LONG_S - SHORT_S) / 2 < KB_PER_SECOND * 1000

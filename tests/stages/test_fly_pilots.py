@@ -32,7 +32,7 @@ DRAWN = replace(SHORT, camera=True, camera_renderer="sketch", duration_s=3.0)
 
 @pytest.fixture(scope="module")
 def ideal(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Four seconds by an ideal eye, without images."""
+    """Return a flight of 4 s with an ideal detector, without images."""
     out = tmp_path_factory.mktemp("ideal") / "flight.mcap"
     fly.run(out, SHORT)
     return out
@@ -40,13 +40,14 @@ def ideal(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def seen(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Three seconds by the shipped network, over sketches."""
+    """Return a flight of 3 s with the shipped network on sketched images."""
     out = tmp_path_factory.mktemp("seen") / "flight.mcap"
     fly.run(out, replace(DRAWN, eye=Path("dmrl-nano")))
     return out
 
 
-def commands(path: Path, robot: str = "cf1") -> np.ndarray:
+def read_commands(path: Path, robot: str = "cf1") -> np.ndarray:
+    """Return the (N, 4) commands of a robot: velocity, m/s, and yaw rate, rad/s."""
     table = read_table(path, topics.COMMAND(robot))
     names = ("vx_mps", "vy_mps", "vz_mps", "yaw_rate_radps")
     return np.column_stack([table[name].to_numpy() for name in names])
@@ -100,7 +101,7 @@ def test_flight_bytes_depend_only_on_the_seed(ideal: Path, tmp_path: Path) -> No
     for seed in (2, 3):
         fly.run(tmp_path / f"{seed}.mcap", replace(SHORT, seed=seed))
     assert (tmp_path / "2.mcap").read_bytes() == ideal.read_bytes()
-    assert not np.allclose(commands(tmp_path / "3.mcap"), commands(ideal))
+    assert not np.allclose(read_commands(tmp_path / "3.mcap"), read_commands(ideal))
 
 
 def test_flight_is_reproduced_from_its_recorded_recipe(seen: Path, tmp_path: Path) -> None:
@@ -110,7 +111,7 @@ def test_flight_is_reproduced_from_its_recorded_recipe(seen: Path, tmp_path: Pat
     settings = {k: v for k, v in made.settings.items() if k != "model_threshold"}
     recipe.write_text(replace(made, settings=settings).to_recipe())
     fly.run(tmp_path / "again.mcap", recipes.load(recipe, "fly", Settings))
-    np.testing.assert_array_equal(commands(tmp_path / "again.mcap"), commands(seen))
+    np.testing.assert_array_equal(read_commands(tmp_path / "again.mcap"), read_commands(seen))
 
 
 def test_predict_and_track_reproduce_onboard_results(seen: Path, tmp_path: Path) -> None:
@@ -126,7 +127,7 @@ def test_predict_and_track_reproduce_onboard_results(seen: Path, tmp_path: Path)
         ]
         for path in (seen, tmp_path / "found.mcap")
     )
-    # A simulated flight rounds what it writes.
+    # A flight rounds the detections that it writes.
     assert np.array(flown) == pytest.approx(np.array(again), abs=1e-7)
     flown, again = (
         [[(t.id, t.x, t.y, t.z) for t in s.message.tracks] for s in read(path, "/cf1/tracks")]
@@ -134,7 +135,7 @@ def test_predict_and_track_reproduce_onboard_results(seen: Path, tmp_path: Path)
     )
     assert len(flown) == 29 and len(again) == 30
     for one, other in zip(flown, again, strict=False):
-        # In flight the height is a mean over the past; dmrl track may use the future as well.
+        # In flight the height is averaged over the past; dmrl track also uses the future.
         assert np.array(one) == pytest.approx(np.array(other), abs=0.02)
 
 
@@ -144,7 +145,7 @@ def test_tracks_are_published_one_image_late(ideal: Path) -> None:
 
 
 class Witness(Pilot):
-    """A pilot that notes what it is told, and hovers."""
+    """A pilot that records its observations and flies a constant command."""
 
     told: list[Observation] = []  # noqa: RUF012 - the test reads it
 
@@ -157,7 +158,7 @@ class Witness(Pilot):
 def test_image_age_is_exact_when_images_are_lost(
     lost: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The image of every number is lost in turn: its detections reach nobody."""
+    """One image is lost, so that its detections do not reach the pilot."""
     monkeypatch.setitem(PILOTS, "witness", Witness)
     Witness.told.clear()
     out = tmp_path / "flight.mcap"
@@ -177,22 +178,17 @@ def test_image_age_is_exact_when_images_are_lost(
 
 @pytest.mark.parametrize("lost", [10, 17, 30])
 def test_a_follower_never_acts_on_the_image_that_is_lost(lost: int, tmp_path: Path) -> None:
-    """What a lost image would have shown changes no command: its detections are never used."""
-    flights = []
-    for pixel_std_px in (1.0, 1.0):
-        out = tmp_path / f"{len(flights)}.mcap"
-        vision = Vision(lost_images=(lost,), pixel_std_px=pixel_std_px)
-        fly.run(out, replace(SHORT, vision=vision))
-        flights.append(commands(out))
-    whole = tmp_path / "whole.mcap"
+    """Commands differ from those of an undisturbed flight once the image would have arrived."""
+    disturbed, whole = tmp_path / "disturbed.mcap", tmp_path / "whole.mcap"
+    fly.run(disturbed, replace(SHORT, vision=Vision(lost_images=(lost,))))
     fly.run(whole, SHORT)
-    np.testing.assert_array_equal(flights[0], flights[1])
-    arrives = 2 * lost + 3  # the command at which its detections would have arrived
-    np.testing.assert_array_equal(flights[0][:arrives], commands(whole)[:arrives])
-    assert not np.array_equal(flights[0][arrives], commands(whole)[arrives])
+    got, wanted = read_commands(disturbed), read_commands(whole)
+    arrives = 2 * lost + 3  # number of the first command after that
+    np.testing.assert_array_equal(got[:arrives], wanted[:arrives])
+    assert not np.array_equal(got[arrives], wanted[arrives])
 
 
-def test_a_pilot_by_the_truth_needs_no_camera(tmp_path: Path) -> None:
+def test_pilot_that_uses_the_truth_needs_no_camera(tmp_path: Path) -> None:
     out = tmp_path / "flight.mcap"
     fly.run(out, replace(SHORT, eye="truth", duration_s=2.0))
     held = read_summary(out).topics
@@ -236,7 +232,7 @@ def test_a_killed_flight_is_recovered_up_to_its_last_second(tmp_path: Path) -> N
     recover(partial, back)
     moments = read_table(back, "/cf1/command")["log_time"].to_numpy()
     assert len(moments) > 60
-    assert np.diff(moments).max() == 50_000_000  # without a gap
+    assert np.diff(moments).max() == 50_000_000  # no gap
     assert not out.exists()
 
 
@@ -280,8 +276,8 @@ def test_the_command_line_takes_pilot_eye_and_distance(tmp_path: Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def int8(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The shipped network, quantised by sketches."""
+def int8_model(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the shipped network, quantised on sketched images."""
     folder = tmp_path_factory.mktemp("int8")
     sketch.run(folder / "pictures", sketch.Settings(images=24))
     convert.run(folder / "pictures", folder / "pictures.mcap", convert.Settings())
@@ -293,13 +289,15 @@ def int8(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.slow
 @pytest.mark.timeout(900)
 @pytest.mark.parametrize("seed", range(16))
-def test_integer_and_c_backends_give_equal_commands(seed: int, int8: Path, tmp_path: Path) -> None:
+def test_integer_and_c_backends_give_equal_commands(
+    seed: int, int8_model: Path, tmp_path: Path
+) -> None:
     flown = []
     for backend in ("integer", "c"):
         out = tmp_path / f"{backend}.mcap"
-        settings = replace(DRAWN, eye=int8, backend=backend, duration_s=30.0, seed=seed)
+        settings = replace(DRAWN, eye=int8_model, backend=backend, duration_s=30.0, seed=seed)
         fly.run(out, settings)
-        flown.append(commands(out))
+        flown.append(read_commands(out))
     assert len(flown[0]) == 601 and np.abs(flown[0]).max() > 0.1
     np.testing.assert_array_equal(flown[0], flown[1])
 
@@ -310,7 +308,7 @@ def test_flights_with_one_place_share_the_room_only(tmp_path: Path) -> None:
         out = tmp_path / f"{name}.mcap"
         fly.run(out, replace(DRAWN, seed=seed, place=place, duration_s=1.0))
         rgb = decode(next(iter(read(out, "/cf1/camera/image"))).message.data).astype(float)
-        first.append((rgb.mean(axis=(0, 1)), commands(out)))
+        first.append((rgb.mean(axis=(0, 1)), read_commands(out)))
     assert not np.allclose(first[0][1], first[1][1])
-    np.testing.assert_array_equal(first[1][1], first[2][1])  # an ideal eye sees no room
+    np.testing.assert_array_equal(first[1][1], first[2][1])  # the ideal detector sees no room
     assert np.abs(first[1][0] - first[2][0]).max() > 2.0

@@ -25,7 +25,7 @@ Run = Callable[..., tuple[int, str]]
 
 @pytest.fixture
 def run(capsys: pytest.CaptureFixture[str]) -> Run:
-    """Run a command; return its status and what it printed."""
+    """Return a function that runs a command and returns exit status and standard output."""
 
     def command(*words: object) -> tuple[int, str]:
         status = boundary.run_to_status(lambda: app([str(word) for word in words]))
@@ -36,7 +36,7 @@ def run(capsys: pytest.CaptureFixture[str]) -> Run:
 
 @pytest.fixture
 def foreign(tmp_path: Path) -> Path:
-    """ROS 2 messages on topics of dmrl, JSON without a schema, attachments and metadata."""
+    """Return a file with ROS 2 messages on dmrl's topics, JSON, attachments and metadata."""
     path = tmp_path / "ros2.mcap"
     with path.open("wb") as stream:
         sink = Writer(stream)
@@ -134,5 +134,5 @@ def test_the_refusal_of_a_type_names_the_command_that_converts_it(foreign: Path)
 @pytest.mark.parametrize(
     ("size", "text"), [(1, "1 byte"), (7_000, "7.0 kB"), (99_949, "99.9 kB"), (100_000, "0.1 MB")]
 )
-def test_a_size_is_never_zero(size: int, text: str) -> None:
+def test_small_sizes_are_not_rounded_to_zero(size: int, text: str) -> None:
     assert format_size(size) == text

@@ -1,3 +1,5 @@
+"""`dmrl label`: positions, labels and reproducibility."""
+
 from dataclasses import replace
 from pathlib import Path
 
@@ -23,11 +25,12 @@ from dmrl.stages import convert, fly, label
 from dmrl.stages.label import Settings
 
 SECOND_NS = 1_000_000_000
-LENIENT = Settings(gate_m=0.5)  # half a minute is short
+LENIENT = Settings(gate_m=0.5)  # a flight of half a minute is too short for the usual gate
 
 
 @pytest.fixture(scope="module")
 def labelled(flight: Path) -> Path:
+    """Return the labelled flight."""
     out = flight.with_name("labelled.mcap")
     label.run(flight, out, LENIENT)
     return out
@@ -99,8 +102,8 @@ def test_labels_are_projections_of_the_positions(labelled: Path) -> None:
     assert seen > 5
 
 
-def off_px(recording: Path) -> float:
-    """Root mean square distance of the labels that are OK from the true ones."""
+def measure_error_px(recording: Path) -> float:
+    """Return the root mean square error of the labels that are OK, pixels."""
     off = []
     for stamped in read(recording, "/cf1/labels"):
         by_source = {peer.source: peer for peer in stamped.message.peers}
@@ -130,7 +133,7 @@ def test_detections_improve_labels(flight: Path, labelled: Path, tmp_path: Path)
             made = message_class("Detections")(detections=found, threshold=0.33)
             sink.write(stamped.time_ns, topics.DETECTIONS("cf1"), made)
     label.run(seen, tmp_path / "refined.mcap", replace(LENIENT, detections=True))
-    assert off_px(tmp_path / "refined.mcap") < 0.6 * off_px(labelled)
+    assert measure_error_px(tmp_path / "refined.mcap") < 0.6 * measure_error_px(labelled)
     with pytest.raises(
         SettingError, match="--detections goes with --method batch or swarm, not ekf"
     ):
@@ -160,12 +163,11 @@ def test_the_same_input_gives_the_same_bytes(flight: Path, labelled: Path, tmp_p
 def test_the_report_knows_the_error_where_the_truth_is_recorded(
     flight: Path, tmp_path: Path
 ) -> None:
-    for method in ("ekf",):
-        result = label.run(flight, tmp_path / f"{method}.mcap", Settings(method=method))
-        assert [(p.robot, p.peer) for p in result.pairs] == [("cf1", "cf2"), ("cf2", "cf1")]
-        assert all(p.rmse_m is not None for p in result.pairs)
-        # These methods are too unsure to label half a minute by the usual gate, and say so.
-        assert not [text for text in result.warnings if "nothing is kept" not in text]
+    result = label.run(flight, tmp_path / "labelled.mcap", Settings(method="ekf"))
+    assert [(p.robot, p.peer) for p in result.pairs] == [("cf1", "cf2"), ("cf2", "cf1")]
+    assert all(p.rmse_m is not None for p in result.pairs)
+    # The filter is too uncertain to label half a minute by the usual gate, and warns of it.
+    assert not [text for text in result.warnings if "nothing is kept" not in text]
 
 
 def test_existing_output_is_not_overwritten(flight: Path) -> None:
@@ -174,7 +176,7 @@ def test_existing_output_is_not_overwritten(flight: Path) -> None:
 
 
 @pytest.mark.heavy
-def test_a_robot_with_a_log_but_no_position_may_be_in_any_image(
+def test_robot_without_positions_is_unconverged_in_every_image(
     flight: Path, tmp_path: Path
 ) -> None:
     third, out = tmp_path / "third.mcap", tmp_path / "labelled.mcap"
@@ -200,7 +202,7 @@ def test_labels_of_empty_images_name_their_source(flight: Path, labelled: Path) 
 
 
 def test_the_noise_of_heights_is_smoothed_away(labelled: Path) -> None:
-    """What is left are the sensors' biases, which are the same through a flight."""
+    """The remaining error is the bias of the height sensors, which is constant during a flight."""
     found = read_table(labelled, "/cf1/peer/cf2/position")
     truth = read_table(labelled, "/cf1/peer/cf2/truth")
     time_ns, truth_ns = found["log_time"].to_numpy(), truth["log_time"].to_numpy()
@@ -233,7 +235,7 @@ def test_label_of_a_peer_without_bearing_is_ambiguous(tmp_path: Path) -> None:
 
 
 @pytest.mark.heavy
-def test_a_known_offset_of_ranges_need_not_be_found(flight: Path, tmp_path: Path) -> None:
+def test_given_range_offset_reduces_the_estimated_one(flight: Path, tmp_path: Path) -> None:
     biases = []
     for offset_m in (0.0, 0.3):
         out = tmp_path / f"{offset_m}.mcap"

@@ -27,8 +27,8 @@ Change = Callable[[Stamped], list[Stamped]]
 
 
 @pytest.fixture
-def changed(flight: Path, tmp_path: Path) -> Callable[[Change], Path]:
-    """The flight's logs, every message through a function."""
+def change_flight(flight: Path, tmp_path: Path) -> Callable[[Change], Path]:
+    """Return a function that writes the flight's logs with every message change_flight."""
 
     def make(change: Change) -> Path:
         out = tmp_path / "changed.mcap"
@@ -41,13 +41,14 @@ def changed(flight: Path, tmp_path: Path) -> Callable[[Change], Path]:
     return make
 
 
-def warnings_of(path: Path) -> str:
+def label_and_warn(path: Path) -> str:
+    """Label a flight; return its warnings, one a line."""
     out = path.with_name("out.mcap")
     return "\n".join(label.run(path, out, Settings(method="ekf")).warnings)
 
 
 def test_impossible_ranges_are_omitted_and_reported(
-    changed: Callable[[Change], Path],
+    change_flight: Callable[[Change], Path],
 ) -> None:
     count = iter(range(10**6))
     bad = (0.0, -1.0, 65535.0, float("nan"))
@@ -58,19 +59,23 @@ def test_impossible_ranges_are_omitted_and_reported(
         return [stamped]
 
     with count_left_out() as left_out:
-        warnings_of(changed(spoil))
+        label_and_warn(change_flight(spoil))
     said = "\n".join(left_out.counts)
     assert "that are not finite, or 1e+06 and more" in said
     assert "that are not in (0, 60] m" in said
 
 
-def test_robot_without_logs_is_omitted_with_a_warning(changed: Callable[[Change], Path]) -> None:
-    def third(stamped: Stamped) -> list[Stamped]:
+def test_robot_without_logs_is_omitted_with_a_warning(
+    change_flight: Callable[[Change], Path],
+) -> None:
+    def add_third_robot(stamped: Stamped) -> list[Stamped]:
         if stamped.topic != "/cf1/range/cf2":
             return [stamped]
         return [stamped, Stamped(stamped.time_ns, "/cf1/range/cf3", stamped.message)]
 
-    assert "cf3: no /cf3/attitude and no /cf3/velocity" in warnings_of(changed(third))
+    assert "cf3: no /cf3/attitude and no /cf3/velocity" in label_and_warn(
+        change_flight(add_third_robot)
+    )
 
 
 def test_a_calibration_of_another_size_or_lens_is_refused(flight: Path, tmp_path: Path) -> None:
@@ -91,12 +96,12 @@ def test_a_calibration_of_another_size_or_lens_is_refused(flight: Path, tmp_path
         label.run(fisheye, tmp_path / "out.mcap", LENIENT)
 
 
-def test_sensor_gap_is_bridged_with_a_warning(changed: Callable[[Change], Path]) -> None:
-    def silent(stamped: Stamped) -> list[Stamped]:
+def test_sensor_gap_is_bridged_with_a_warning(change_flight: Callable[[Change], Path]) -> None:
+    def drop_velocities(stamped: Stamped) -> list[Stamped]:
         quiet = 10 * SECOND_NS < stamped.time_ns < 13 * SECOND_NS
         return [] if quiet and stamped.topic == "/cf2/velocity" else [stamped]
 
-    assert "cf2 is silent for" in warnings_of(changed(silent))
+    assert "cf2 is silent for" in label_and_warn(change_flight(drop_velocities))
 
 
 def test_a_clock_that_went_back_is_named(flight: Path, tmp_path: Path) -> None:
@@ -106,30 +111,30 @@ def test_a_clock_that_went_back_is_named(flight: Path, tmp_path: Path) -> None:
             late = one.topic == "/cf2/velocity" and one.time_ns > 20 * SECOND_NS
             time_ns = one.time_ns - 5 * SECOND_NS * late
             sink.write(time_ns, one.topic, one.message, publish_ns=one.time_ns)
-    assert "/cf2/velocity: its clock goes back" in warnings_of(path)
+    assert "/cf2/velocity: its clock goes back" in label_and_warn(path)
 
 
-def test_angles_in_degrees_give_a_warning(changed: Callable[[Change], Path]) -> None:
-    def degrees(stamped: Stamped) -> list[Stamped]:
+def test_angles_in_degrees_give_a_warning(change_flight: Callable[[Change], Path]) -> None:
+    def convert_to_degrees(stamped: Stamped) -> list[Stamped]:
         if stamped.topic == "/cf1/attitude":
             stamped.message.roll_rad *= 57.3
             stamped.message.pitch_rad *= 57.3
         return [stamped]
 
-    assert "Are they degrees?" in warnings_of(changed(degrees))
+    assert "Are they degrees?" in label_and_warn(change_flight(convert_to_degrees))
 
 
 def test_clocks_an_hour_apart_are_an_error_of_one_line(
-    changed: Callable[[Change], Path], tmp_path: Path
+    change_flight: Callable[[Change], Path], tmp_path: Path
 ) -> None:
-    def late(stamped: Stamped) -> list[Stamped]:
+    def delay(stamped: Stamped) -> list[Stamped]:
         hour = 3600 * SECOND_NS if stamped.topic.startswith("/cf2") else 0
         return [Stamped(stamped.time_ns + hour, stamped.topic, stamped.message)]
 
     with pytest.raises(
         RecordingError, match=r"share 0\.0 s.*clocks agree\? Try: dmrl align"
     ) as caught:
-        warnings_of(changed(late))
+        label_and_warn(change_flight(delay))
     assert "\n" not in str(caught.value)
     assert not list(tmp_path.glob("out*"))
 
@@ -142,9 +147,9 @@ def test_clocks_an_hour_apart_are_an_error_of_one_line(
     ],
 )
 def test_recording_without_ranges_is_refused(
-    changed: Callable[[Change], Path], held: list[str], why: str
+    change_flight: Callable[[Change], Path], held: list[str], why: str
 ) -> None:
-    out = changed(lambda s: [s])
+    out = change_flight(lambda s: [s])
     bare = out.with_name("bare.mcap")
     with RecordingWriter(bare, Provenance("test")) as sink:
         for stamped in read(out, *(f"/*/{name}" for name in held)):

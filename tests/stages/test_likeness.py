@@ -1,3 +1,5 @@
+"""`dmrl likeness` fits the look of rendered images to real ones."""
+
 import errno
 import json
 import tomllib
@@ -37,8 +39,8 @@ CAMERAS = {
 }
 
 
-def frames(folder: Path, camera: str) -> Path:
-    """Frames of a camera that is not the preset's, of rooms that nobody else sees."""
+def write_frames(folder: Path, camera: str) -> Path:
+    """Write 32 images of a camera that differs from the preset."""
     folder.mkdir()
     own = {"preset": "himax", "read_noise": [0.006, 0.007], **CAMERAS[camera]}
     settings = recipes.check(camera, looks.filled(own), looks.Settings)
@@ -48,8 +50,8 @@ def frames(folder: Path, camera: str) -> Path:
     return folder
 
 
-def off(found: ImageStatistics, real: ImageStatistics) -> float:
-    """The greatest error of a figure: relative, but of what is nearly nothing the plain one."""
+def compute_worst_error(found: ImageStatistics, real: ImageStatistics) -> float:
+    """Return the largest error of a figure: relative, or absolute for figures below 0.1."""
     pairs = [(getattr(found, name), getattr(real, name)) for name in FIGURES]
     return max(abs(one - other) / (other if other > 0.1 else 1) for one, other in pairs)
 
@@ -57,10 +59,10 @@ def off(found: ImageStatistics, real: ImageStatistics) -> float:
 @pytest.mark.heavy
 @pytest.mark.parametrize("camera", CAMERAS)
 def test_fitted_preset_reproduces_the_figures_of_the_frames(camera: str, tmp_path: Path) -> None:
-    result = run(frames(tmp_path / "own", camera), tmp_path / "own.toml", Settings())
+    result = run(write_frames(tmp_path / "own", camera), tmp_path / "own.toml", Settings())
     assert result.frames == 32
-    assert off(result.fitted, result.real) < 0.2
-    assert off(result.preset, result.real) > 0.2
+    assert compute_worst_error(result.fitted, result.real) < 0.2
+    assert compute_worst_error(result.preset, result.real) > 0.2
     settings = read_render_settings(str(tmp_path / "own.toml"))
     assert settings.bayer == (camera == "colour")
     assert (settings.saturation[1] == 0) == (camera == "grey")
@@ -70,7 +72,7 @@ def test_fitted_preset_reproduces_the_figures_of_the_frames(camera: str, tmp_pat
 
 @pytest.mark.heavy
 def test_the_same_frames_give_the_same_bytes(tmp_path: Path) -> None:
-    own = frames(tmp_path / "own", "grey")
+    own = write_frames(tmp_path / "own", "grey")
     for name in ("a", "b"):
         run(own, tmp_path / f"{name}.toml", Settings(frames=4))
     for end in (".toml", ".png"):
@@ -118,7 +120,8 @@ def test_frames_that_cannot_be_measured_give_one_line_errors(tmp_path: Path, dot
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.png", "mixed", "none"]
 
 
-def folder_of(path: Path, frames: list[NDArray[np.uint8]]) -> Path:
+def write_images(path: Path, frames: list[NDArray[np.uint8]]) -> Path:
+    """Write images to a new folder; return it."""
     path.mkdir()
     for k, rgb in enumerate(frames):
         (path / f"{k}.png").write_bytes(encode_png(rgb))
@@ -137,7 +140,7 @@ def folder_of(path: Path, frames: list[NDArray[np.uint8]]) -> Path:
 def test_frames_that_show_no_camera_give_one_line_errors(
     frames: list[NDArray[np.uint8]], said: str, tmp_path: Path
 ) -> None:
-    own = folder_of(tmp_path / "own", frames)
+    own = write_images(tmp_path / "own", frames)
     with pytest.raises(SettingError, match=said):
         run(own, tmp_path / "a.toml", Settings())
     assert [path.name for path in tmp_path.iterdir()] == ["own"]
@@ -150,7 +153,7 @@ def test_unmeasurable_figures_are_reported_and_kept(
     """Black and white stripes have sharp edges, but no grain."""
     for name in ("COARSE", "FINE"):
         monkeypatch.setattr(preset_fitting, name, (1, 2))
-    own, out = folder_of(tmp_path / "own", [STRIPES]), tmp_path / "a.toml"
+    own, out = write_images(tmp_path / "own", [STRIPES]), tmp_path / "a.toml"
     app(["likeness", str(own), str(out)], result_action="return_value")
     output = capsys.readouterr()
     assert "holds 1 frame: few" in output.err and "50% of the pixels" in output.err
@@ -161,10 +164,13 @@ def test_unmeasurable_figures_are_reported_and_kept(
 
 
 @pytest.mark.heavy
-def test_a_picture_that_a_killed_run_left_is_no_obstacle(
+def test_preview_left_by_a_killed_run_is_replaced(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It has its name before the recipe; another's picture stays, and an error leaves neither."""
+    """The picture is renamed before the recipe, so that a killed run may leave it alone.
+
+    A picture of another program is never replaced, and an error leaves neither file.
+    """
     for name in ("COARSE", "FINE"):
         monkeypatch.setattr(preset_fitting, name, (1, 2))
     dots, out = Inputs(tmp_path).dots, tmp_path / "a.toml"
@@ -180,12 +186,12 @@ def test_a_picture_that_a_killed_run_left_is_no_obstacle(
     assert (tmp_path / "a.png").read_bytes() == b"mine" and not out.exists()
     (tmp_path / "a.png").unlink()
 
-    def full(*_: object) -> None:
+    def fail(*_: object) -> None:
         raise OSError(errno.ENOSPC, "No space left on device", str(out))
 
-    # The first name that is given is the picture's.
+    # The picture is renamed first, the recipe fails.
     monkeypatch.setattr(
-        "dmrl.atomic_output.sync", lambda path: full() if "toml" in path.name else None
+        "dmrl.atomic_output.sync", lambda path: fail() if "toml" in path.name else None
     )
     with pytest.raises(FullDisk):
         run(dots, out, Settings())

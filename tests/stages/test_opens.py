@@ -1,4 +1,4 @@
-"""Number of times a command opens its input."""
+"""Number of times that a command opens its input, counted by an audit hook."""
 
 import os
 import sys
@@ -13,12 +13,13 @@ from dmrl.stages import dataset, label
 OPENED: Counter[str] = Counter()
 
 
-def _count(event: str, arguments: tuple[Any, ...]) -> None:
+def _count_open(event: str, arguments: tuple[Any, ...]) -> None:
+    """Count the opening of a file by its path."""
     if event == "open" and isinstance(arguments[0], str | os.PathLike):
         OPENED[os.fspath(arguments[0])] += 1
 
 
-sys.addaudithook(_count)  # sees every way to open a file, and cannot be removed
+sys.addaudithook(_count_open)  # sees every way to open a file, and cannot be removed
 
 
 @pytest.mark.heavy

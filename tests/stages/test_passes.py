@@ -1,4 +1,4 @@
-"""Number of passes of each command over a recording, in decompressed chunks."""
+"""Number of passes of each command over a recording: decompressed chunks over all chunks."""
 
 from collections import Counter
 from collections.abc import Callable
@@ -24,7 +24,7 @@ Passes = Callable[[Path], float]
 
 @pytest.fixture(scope="module")
 def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two robots for half a minute, pictures of one, and what a network found in them."""
+    """Return a flight of two robots over 30 s with images and detections of one, in many chunks."""
     folder = tmp_path_factory.mktemp("passes")
     flown, out = folder / "flown.mcap", folder / "flight.mcap"
     with pytest.MonkeyPatch.context() as patch:
@@ -36,7 +36,7 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
         with RecordingWriter(out, build_provenance("test", inputs=[flown])) as sink:
             copy_messages(flown, TopicSelection(frozenset(read_summary(flown).topics)), sink)
             rng = np.random.default_rng(0)
-            for time_ns in _times(flown, "/cf1/camera/image"):
+            for time_ns in _read_times(flown, "/cf1/camera/image"):
                 found = {"u_px": rng.uniform(0, 320), "v_px": 100.0, "depth_m": 1.0}
                 seen = [{**found, "confidence": 0.9}]
                 made = message_class("Detections")(detections=seen, threshold=0.5)
@@ -44,12 +44,14 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def _times(path: Path, topic: str) -> list[int]:
+def _read_times(path: Path, topic: str) -> list[int]:
+    """Return the log times of a topic, nanoseconds."""
     with path.open("rb") as stream:
         return [m.log_time for _, _, m in make_reader(stream).iter_messages([topic])]
 
 
-def _chunks(path: Path) -> int:
+def _count_chunks(path: Path) -> int:
+    """Return the number of chunks of a recording."""
     with path.open("rb") as stream:
         found = make_reader(stream).get_summary()
     assert found is not None
@@ -58,18 +60,18 @@ def _chunks(path: Path) -> int:
 
 @pytest.fixture
 def passes(monkeypatch: pytest.MonkeyPatch) -> Passes:
-    """How often a recording was gone over since the last call."""
+    """Return a function that returns the passes over a recording since its last call."""
     opened: Counter[str] = Counter()
     load = chunk_reader._load_chunk
 
-    def counted(stream: BoundedReader, index: ChunkIndex) -> object:
+    def load_counted(stream: BoundedReader, index: ChunkIndex) -> object:
         opened[stream.path.name] += 1
         return load(stream, index)
 
-    monkeypatch.setattr(chunk_reader, "_load_chunk", counted)
+    monkeypatch.setattr(chunk_reader, "_load_chunk", load_counted)
 
     def count(path: Path) -> float:
-        found = opened[path.name] / _chunks(path)
+        found = opened[path.name] / _count_chunks(path)
         opened.clear()
         return found
 
@@ -77,7 +79,7 @@ def passes(monkeypatch: pytest.MonkeyPatch) -> Passes:
 
 
 def test_a_check_is_one_pass(flight: Path, passes: Passes) -> None:
-    assert _chunks(flight) > 40
+    assert _count_chunks(flight) > 40
     check(flight)
     assert passes(flight) == 1.0
 

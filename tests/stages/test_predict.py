@@ -1,3 +1,5 @@
+"""`dmrl predict`: detections, backends and errors."""
+
 import json
 import sys
 import threading
@@ -25,7 +27,8 @@ from dmrl.terminal.left_out import count_left_out
 OWN = ("/cf1/detections", "/cf1/detections/grid")
 
 
-def recording(path: Path, *sizes_px: tuple[int, int], robot: str = "cf1") -> Path:
+def write_recording(path: Path, *sizes_px: tuple[int, int], robot: str = "cf1") -> Path:
+    """Write images of these widths and heights."""
     with RecordingWriter(path, Provenance("test")) as sink:
         for k, (width_px, height_px) in enumerate(sizes_px):
             data = encode_png(np.full((height_px, width_px, 3), 40 * k, np.uint8))
@@ -136,7 +139,7 @@ def test_a_batch_may_be_larger_than_the_recording(dots: Path, model: Path, tmp_p
 
 
 def test_images_of_several_sizes_go_through(model: Path, tmp_path: Path) -> None:
-    mixed = recording(tmp_path / "mixed.mcap", (64, 48), (32, 32), (32, 32), (64, 48))
+    mixed = write_recording(tmp_path / "mixed.mcap", (64, 48), (32, 32), (32, 32), (64, 48))
     run(model, mixed, tmp_path / "out.mcap", Settings())
     grids = [s.message for s in read(tmp_path / "out.mcap", OWN[1])]
     assert [(g.rows, g.cols) for g in grids] == [(6, 8), (4, 4), (4, 4), (6, 8)]
@@ -145,7 +148,7 @@ def test_images_of_several_sizes_go_through(model: Path, tmp_path: Path) -> None
 def test_an_image_of_a_size_that_the_model_does_not_take_is_left_out(
     model: Path, tmp_path: Path
 ) -> None:
-    mixed = recording(tmp_path / "mixed.mcap", (60, 48), (64, 48))
+    mixed = write_recording(tmp_path / "mixed.mcap", (60, 48), (64, 48))
     with count_left_out() as left:
         assert run(model, mixed, tmp_path / "out.mcap", Settings()).images == 1
     assert left.counts == {"images of a size that the model does not take": 1}
@@ -169,7 +172,7 @@ def test_batch_of_large_images_is_limited_by_pixels(
 @pytest.mark.heavy
 def test_bad_input_is_one_line_and_leaves_nothing(dots: Path, model: Path, tmp_path: Path) -> None:
     out = tmp_path / "out.mcap"
-    odd = recording(tmp_path / "odd.mcap", (60, 48))
+    odd = write_recording(tmp_path / "odd.mcap", (60, 48))
     with pytest.raises(SettingError, match=r"odd\.mcap: the image of .* 60 x 48 px do not divide"):
         run(model, odd, out, Settings())
     with RecordingWriter(tmp_path / "blind.mcap", Provenance("test")) as sink:
@@ -223,11 +226,11 @@ def test_an_unknown_model_is_refused_before_its_backend_is_named(
 
 @pytest.mark.heavy
 def test_fastest_backend_is_chosen_and_reported(
-    dots: Path, settled: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    dots: Path, random_model: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    run(settled, dots, tmp_path / "out.mcap", Settings())
-    assert f"{settled} runs by onnx; --backend chooses another" in capsys.readouterr().err
-    run(settled, dots, tmp_path / "named.mcap", Settings(backend="onnx"))
+    run(random_model, dots, tmp_path / "out.mcap", Settings())
+    assert f"{random_model} runs by onnx; --backend chooses another" in capsys.readouterr().err
+    run(random_model, dots, tmp_path / "named.mcap", Settings(backend="onnx"))
     assert "--backend" not in capsys.readouterr().err
     assert (tmp_path / "out.mcap").read_bytes() == (tmp_path / "named.mcap").read_bytes()
     made = read_summary(tmp_path / "out.mcap").provenance
@@ -237,34 +240,34 @@ def test_fastest_backend_is_chosen_and_reported(
 
 @pytest.mark.heavy
 def test_torch_is_taken_where_onnx_would_not_do(
-    settled: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    random_model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert select_fastest_backend(settled, (64, 48)) == "onnx"
-    assert select_fastest_backend(settled, (72, 48)) == "torch"  # ONNX files are of one size
+    assert select_fastest_backend(random_model, (64, 48)) == "onnx"
+    # An ONNX file has one image size.
+    assert select_fastest_backend(random_model, (72, 48)) == "torch"
     (tmp_path / "more").mkdir()
     network = build_network("dmrl-nano", seed=1, extra=("log_spread",)).eval()
     save_model(Model(network, "dmrl-nano", width_px=64, height_px=48), tmp_path / "more")
-    assert (
-        select_fastest_backend(tmp_path / "more", (64, 48)) == "torch"
-    )  # which says the spread as well
+    # Only torch returns the additional output.
+    assert select_fastest_backend(tmp_path / "more", (64, 48)) == "torch"
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
     monkeypatch.delitem(sys.modules, "dmrl.deploy.onnx.runtime", raising=False)
-    assert select_fastest_backend(settled, (64, 48)) == "torch"
+    assert select_fastest_backend(random_model, (64, 48)) == "torch"
 
 
 def test_onnxruntime_keeps_to_the_threads_of_a_worker(
-    dots: Path, settled: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    dots: Path, random_model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked: list[int] = []
 
-    class Asked(onnx_run.onnxruntime.SessionOptions):  # type: ignore[misc]
+    class SpySessionOptions(onnx_run.onnxruntime.SessionOptions):  # type: ignore[misc]
         def __setattr__(self, name: str, value: Any) -> None:
             asked.extend([value] * (name == "intra_op_num_threads"))
             super().__setattr__(name, value)
 
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
-    monkeypatch.setattr(onnx_run.onnxruntime, "SessionOptions", Asked)
-    run(settled, dots, tmp_path / "out.mcap", Settings(backend="onnx"))
+    monkeypatch.setattr(onnx_run.onnxruntime, "SessionOptions", SpySessionOptions)
+    run(random_model, dots, tmp_path / "out.mcap", Settings(backend="onnx"))
     assert asked == [1]
 
 
@@ -273,11 +276,11 @@ def test_pictures_are_decoded_in_another_thread(
 ) -> None:
     threads: set[threading.Thread] = set()
 
-    def noted(picture: ImageHeader, most: int) -> Any:
+    def decode_noted(picture: ImageHeader, most: int) -> Any:
         threads.add(threading.current_thread())
         return decoded(picture, most)
 
     decoded = ImageHeader.decode
-    monkeypatch.setattr(ImageHeader, "decode", noted)
+    monkeypatch.setattr(ImageHeader, "decode", decode_noted)
     run(model, dots, tmp_path / "out.mcap", Settings(batch_size=3))
     assert threads and threading.main_thread() not in threads

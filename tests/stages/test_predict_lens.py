@@ -1,4 +1,4 @@
-"""A network's depths hold for the focal lengths that it was trained with."""
+"""Depths of a network are valid for the focal lengths of its training only."""
 
 import json
 from pathlib import Path
@@ -14,8 +14,8 @@ from dmrl.prediction import warn_about_lens
 from dmrl.recording import Provenance, RecordingWriter
 
 
-def calibrated(path: Path, focal_px: float) -> Path:
-    """Write a recording with the calibration of a camera."""
+def write_calibration(path: Path, focal_px: float) -> Path:
+    """Write a recording of one calibration with this focal length, pixels."""
     k = [focal_px, 0.0, 160.0, 0.0, focal_px, 112.0, 0.0, 0.0, 1.0]
     calibration = message_class("CameraCalibration")(width=320, height=224, K=k)
     with RecordingWriter(path, Provenance("test")) as out:
@@ -27,7 +27,7 @@ def calibrated(path: Path, focal_px: float) -> Path:
 def test_another_focal_length_than_the_models_gets_a_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], focal_px: float, line: str
 ) -> None:
-    warn_about_lens(Path("dmrl-nano"), calibrated(tmp_path / "a.mcap", focal_px))
+    warn_about_lens(Path("dmrl-nano"), write_calibration(tmp_path / "a.mcap", focal_px))
     told = capsys.readouterr().err
     assert line in told and bool(told) == bool(line)
 

@@ -1,3 +1,5 @@
+"""`dmrl quantize`: the int8 model and its report."""
+
 import json
 import shutil
 from pathlib import Path
@@ -19,20 +21,24 @@ from dmrl.stages.quantize import Settings, run
 
 
 @pytest.mark.heavy
-def test_a_quantised_model_is_a_run_folder_with_more(quantised: Path, settled: Path) -> None:
-    names = {path.name for path in quantised.iterdir()}
+def test_a_quantised_model_is_a_run_folder_with_more(
+    quantised_model: Path, random_model: Path
+) -> None:
+    names = {path.name for path in quantised_model.iterdir()}
     assert names >= {"integer.npz", "samples.npz", "quantisation.json", "provenance.json"}
-    wanted, got = (load_model(path).network.state_dict() for path in (settled, quantised))
+    wanted, got = (
+        load_model(path).network.state_dict() for path in (random_model, quantised_model)
+    )
     assert all((wanted[name] == got[name]).all() for name in wanted)
-    network = load_network(quantised)
+    network = load_network(quantised_model)
     assert (network.width_px, network.height_px, network.channels) == (64, 48, 3)
-    assert network.architecture == load_model(settled).architecture
+    assert network.architecture == load_model(random_model).architecture
 
 
 @pytest.mark.heavy
-def test_the_report_has_every_layer_and_both_accuracies(quantised: Path) -> None:
-    said = json.loads((quantised / "quantisation.json").read_text())
-    network = load_network(quantised)
+def test_the_report_has_every_layer_and_both_accuracies(quantised_model: Path) -> None:
+    said = json.loads((quantised_model / "quantisation.json").read_text())
+    network = load_network(quantised_model)
     heads = {head.tensor for head in network.heads.values()}
     assert len(said["layers"]) == len(network.layers) - len(heads) + len(network.heads)
     assert all(layer["sqnr_db"] > 10 for layer in said["layers"] if layer["sqnr_db"] is not None)
@@ -44,13 +50,13 @@ def test_the_report_has_every_layer_and_both_accuracies(quantised: Path) -> None
 
 @pytest.mark.heavy
 def test_same_inputs_same_bytes(
-    settled: Path, dots_dataset: Path, quantised: Path, tmp_path: Path
+    random_model: Path, dots_dataset: Path, quantised_model: Path, tmp_path: Path
 ) -> None:
-    again = tmp_path / settled.name
+    again = tmp_path / random_model.name
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(quantization_report, "plots", None)
-        run(settled, dots_dataset, again, Settings())
-    for path in quantised.iterdir():
+        run(random_model, dots_dataset, again, Settings())
+    for path in quantised_model.iterdir():
         assert path.read_bytes() == (again / path.name).read_bytes(), path.name
 
 
@@ -68,10 +74,10 @@ def test_float_and_int8_maps_are_drawn(model: Path, dots_dataset: Path, tmp_path
 
 @pytest.mark.heavy
 def test_a_grey_network_takes_one_channel(
-    settled: Path, dots_dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    random_model: Path, dots_dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(quantization_report, "plots", None)
-    result = run(settled, dots_dataset, tmp_path / "grey", Settings(grey=True))
+    result = run(random_model, dots_dataset, tmp_path / "grey", Settings(grey=True))
     first = load_network(tmp_path / "grey").layers[0]
     assert isinstance(first, Conv)
     assert first.weight.shape[1] == result.network.channels == 1
@@ -88,7 +94,7 @@ def test_images_of_another_size_are_refused(
 
 @pytest.mark.heavy
 def test_constant_images_are_refused(
-    settled: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    random_model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     recording = tmp_path / "plain.mcap"
     with RecordingWriter(recording, Provenance("test")) as sink:
@@ -101,26 +107,28 @@ def test_constant_images_are_refused(
             sink.write(k, "/cf1/labels", message_class("PeerLabels")(peers=[peer]))
     dataset.run([recording], tmp_path / "plain", dataset.Settings())
     with pytest.raises(SettingError, match="calibration images is of a single colour"):
-        run(settled, tmp_path / "plain", tmp_path / "out", Settings())
+        run(random_model, tmp_path / "plain", tmp_path / "out", Settings())
     assert not list(tmp_path.glob("out*"))
 
 
-def test_an_output_that_exists_is_kept(settled: Path, dots_dataset: Path, tmp_path: Path) -> None:
+def test_an_output_that_exists_is_kept(
+    random_model: Path, dots_dataset: Path, tmp_path: Path
+) -> None:
     (tmp_path / "out").mkdir()
     with pytest.raises(OutputError, match="exists"):
-        run(settled, dots_dataset, tmp_path / "out", Settings())
+        run(random_model, dots_dataset, tmp_path / "out", Settings())
 
 
 @pytest.mark.heavy
 def test_the_command_prints_layers_and_accuracies(
-    settled: Path,
+    random_model: Path,
     dots_dataset: Path,
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(quantization_report, "plots", None)
-    flags = [str(settled), str(dots_dataset)]
+    flags = [str(random_model), str(dots_dataset)]
     app(["quantize", *flags, str(tmp_path / "a")], result_action="return_value")
     printed = capsys.readouterr()
     assert "SQNR" in printed.out
@@ -136,7 +144,7 @@ def test_int8_of_the_published_weights_is_as_good_as_float(data: Path, tmp_path:
     convert.run(data / "locanet-synthetic", tmp_path / "single.mcap", convert.Settings())
     dataset.run([tmp_path / "single.mcap"], tmp_path / "dataset", dataset.Settings())
     weights = data / "locanet-weights" / "synthetic.h5"
-    # Every image that there is, so that one of them is a tenth of a point.
+    # All training images are used, so that one image counts about 0.1 %.
     result = run(weights, tmp_path / "dataset", tmp_path / "out", Settings(split="train"))
     wanted, got = result.accuracy["float"], result.accuracy["int8"]
     for name in ("within_20_px", "depth_mae_m"):

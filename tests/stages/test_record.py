@@ -1,3 +1,5 @@
+"""`dmrl record` with simulated drones: losses, restarts, signals and errors."""
+
 import os
 import re
 import signal
@@ -26,7 +28,7 @@ from dmrl.stages import fake_drone, fly, record
 
 pytest.importorskip("cflib", reason="cflib (extra record) is not installed")
 
-# cflib's own threads may meet a link that another of them has just closed.
+# Threads of cflib may use a link that another of its threads has just closed.
 pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
 
 PATIENCE_S = 100.0
@@ -36,14 +38,15 @@ ANY = ("udp://127.0.0.1:0", "udp://127.0.0.1:0")
 
 @pytest.fixture(scope="module")
 def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two robots that fly for 3 s."""
+    """Return a flight of two robots over 3 s with images."""
     path = tmp_path_factory.mktemp("flight") / "sim.mcap"
     pictures = {"camera": True, "camera_rate_hz": PICTURES_HZ}
     fly.run(path, fly.Settings(duration_s=3.0, noise="ideal", seed=3, **pictures))
     return path
 
 
-def robots(fleet: Fleet) -> list[RobotOptions]:
+def list_robots(fleet: Fleet) -> list[RobotOptions]:
+    """Return the addresses of the robots of a simulated fleet."""
     ports = {camera.robot: camera.port for camera in fleet.cameras}
     return [
         RobotOptions(
@@ -55,25 +58,26 @@ def robots(fleet: Fleet) -> list[RobotOptions]:
     ]
 
 
-def recorded(out: Path, fleet: Fleet, until: Callable[[], bool]) -> Result:
-    """Record until something is so."""
+def record_until(out: Path, fleet: Fleet, until: Callable[[], bool]) -> Result:
+    """Record until a condition holds, and another 1.5 s."""
     ended = threading.Event()
 
     def watch() -> None:
         deadline = time.monotonic() + PATIENCE_S
         while time.monotonic() < deadline and not until():
             time.sleep(0.02)
-        time.sleep(1.5)  # what is still on its way, on a busy machine
+        time.sleep(1.5)  # for packets that are still on their way on a busy machine
         ended.set()
 
     watcher = threading.Thread(target=watch)
     watcher.start()
-    result = record.run(out, robots(fleet), record.Settings(), ended=ended)
+    result = record.run(out, list_robots(fleet), record.Settings(), ended=ended)
     watcher.join()
     return result
 
 
-def by_source(result: Result) -> dict[str, tuple[int, int, int]]:
+def count_packets(result: Result) -> dict[str, tuple[int, int, int]]:
+    """Return the received, lost and broken packets of each source."""
     return {h.source: (h.received, h.lost, h.broken) for h in result.healths}
 
 
@@ -83,8 +87,8 @@ def test_every_packet_sent_is_recorded(flight: Path, tmp_path: Path) -> None:
     # The clock of the drones wraps one second after take-off.
     settings = fake_drone.Settings(sends="streamer", boot_ms=float((1 << 24) - 1000))
     with drone_fleet.fleet(flight, ANY, (0, 0), settings) as fleet:
-        result = recorded(out, fleet, lambda: fleet.clock.landed)
-    got = by_source(result)
+        result = record_until(out, fleet, lambda: fleet.clock.landed)
+    got = count_packets(result)
     for drone in fleet.drones:
         received, lost, broken = got[drone.robot]
         assert lost == broken == 0
@@ -92,12 +96,12 @@ def test_every_packet_sent_is_recorded(flight: Path, tmp_path: Path) -> None:
         assert drone.setpoints == 0
     for camera in fleet.cameras:
         assert got[f"{camera.robot} camera"] == (camera.sent, 0, 0)
-    starts = {robot: assert_as_flown(flight, out, robot) for robot in ("cf1", "cf2")}
+    starts = {robot: assert_equals_flight(flight, out, robot) for robot in ("cf1", "cf2")}
     assert abs(starts["cf1"] - starts["cf2"]) < 20e6
 
 
-def assert_as_flown(flight: Path, out: Path, robot: str) -> float:
-    """Checks values and images against their times; the log time of take-off, nanoseconds."""
+def assert_equals_flight(flight: Path, out: Path, robot: str) -> float:
+    """Assert that values, images and times equal the flight; return the time of take-off, ns."""
     fields = ("roll_rad", "pitch_rad", "yaw_rate_radps")
     flown, got = (read_table(p, f"/{robot}/attitude", fields=fields) for p in (flight, out))
     values, expected = (np.column_stack([t[f].to_numpy() for f in fields]) for t in (got, flown))
@@ -108,7 +112,7 @@ def assert_as_flown(flight: Path, out: Path, robot: str) -> float:
     start_ns = float(times[0]) - 10e6 * first
     pictures = [decode(m.message.data).astype(int) for m in read(flight, f"/{robot}/camera/image")]
     for stamped in read(out, f"/{robot}/camera/image"):
-        # On the drone's own clock, but for the 1.5 ms that its state takes to the camera.
+        # The time is on the drone's clock, up to the 1.5 ms that a state takes to the camera.
         number = ((stamped.time_ns - start_ns) * 1e-9 - FIRST_PICTURE_S) * PICTURES_HZ
         assert abs(number - round(number)) < 0.01 * PICTURES_HZ
         assert np.abs(decode(stamped.message.data) - pictures[round(number)]).mean() < 8
@@ -129,7 +133,8 @@ def test_simulated_drones_wait_until_all_packets_are_received(flight: Path, tmp_
     recorder = threading.Thread(target=listen)
     recorder.start()
     fleet = fake_drone.run(flight, [uri], [], fake_drone.Settings())
-    assert fleet.clock.now_s() >= fleet.clock.end_s + fake_drone.LINGER_S  # nobody said goodbye
+    # The recorder did not disconnect, so the drones waited.
+    assert fleet.clock.now_s() >= fleet.clock.end_s + fake_drone.LINGER_S
     ended.set()
     recorder.join()
     (drone,) = fleet.drones
@@ -142,13 +147,13 @@ def test_dropped_packets_are_counted_and_a_dead_drone_does_not_stop_others(
 ) -> None:
     settings = fake_drone.Settings(drop=0.05, dies=("cf2=1",), sends="stamped")
     with drone_fleet.fleet(flight, ANY, (0,), settings) as fleet:
-        result = recorded(tmp_path / "out.mcap", fleet, lambda: fleet.clock.landed)
+        result = record_until(tmp_path / "out.mcap", fleet, lambda: fleet.clock.landed)
     cf1, cf2 = fleet.drones
-    received, lost, _ = by_source(result)["cf1"]
+    received, lost, _ = count_packets(result)["cf1"]
     assert received == cf1.sent > 500
-    # What is dropped before the first packet of a block or after its last one nobody can see.
+    # Packets that are dropped before the first or after the last of a block cannot be counted.
     assert cf1.dropped - 3 <= lost <= cf1.dropped and cf1.dropped > 10
-    assert by_source(result)["cf2"][0] == cf2.sent
+    assert count_packets(result)["cf2"][0] == cf2.sent
     assert result.messages["/cf1/attitude"] > 250 and result.messages["/cf2/attitude"] < 150
 
 
@@ -161,15 +166,15 @@ def test_undecodable_packet_restarts_the_connection_only(
 ) -> None:
     samples, packets = crazyflie_link.LogDecoder.iter_samples, count()
 
-    def once_wrong(self: crazyflie_link.LogDecoder, *packet: Any) -> Any:
+    def fail_once(self: crazyflie_link.LogDecoder, *packet: Any) -> Any:
         if next(packets) == 20:
             raise ValueError("no such number")
         return samples(self, *packet)
 
     monkeypatch.setattr(crazyflie_link, "RETRY_DELAY_S", 0.1)
-    monkeypatch.setattr(crazyflie_link.LogDecoder, "iter_samples", once_wrong)
+    monkeypatch.setattr(crazyflie_link.LogDecoder, "iter_samples", fail_once)
     with drone_fleet.fleet(flight, ANY[:1], (), fake_drone.Settings(speed=0.5)) as fleet:
-        result = recorded(tmp_path / "out.mcap", fleet, lambda: fleet.clock.landed)
+        result = record_until(tmp_path / "out.mcap", fleet, lambda: fleet.clock.landed)
     said = "cf1: a packet could not be read (ValueError('no such number')) at udp://"
     assert said in capsys.readouterr().err
     assert result.healths[0].connections >= 2 and result.messages["/cf1/attitude"] > 50
@@ -188,14 +193,14 @@ def test_restarted_drone_is_reconnected(
     settings = fake_drone.Settings(dies=("cf1=0.5:0.8",), speed=0.3)
     with drone_fleet.fleet(flight, ANY[:1], (), settings) as fleet:
         (drone,) = fleet.drones
-        result = recorded(tmp_path / "out.mcap", fleet, lambda: drone.sent > 160)
+        result = record_until(tmp_path / "out.mcap", fleet, lambda: drone.sent > 160)
     assert result.healths[0].connections >= 2
     times = read_table(tmp_path / "out.mcap", "/cf1/attitude", fields=[])["log_time"].to_numpy()
     assert (np.diff(times) > 0).all()
 
 
-def attitudes_in(partial: Path, mended: Path) -> int:
-    """How many attitudes of cf1 a recovery brings back."""
+def recover_attitudes(partial: Path, mended: Path) -> int:
+    """Recover a partial recording; return its number of attitudes of cf1."""
     mended.unlink(missing_ok=True)
     try:
         recover(partial, mended)
@@ -211,18 +216,18 @@ def test_killed_session_is_recovered_up_to_its_last_second(flight: Path, tmp_pat
     with drone_fleet.fleet(flight, ANY, (0, 0), fake_drone.Settings()) as fleet:
         named = [
             f"--robot={r.name}={r.uri},camera={r.camera[0]}:{r.camera[1]}"
-            for r in robots(fleet)
+            for r in list_robots(fleet)
             if r.camera
         ]
         command = [sys.executable, "-m", "dmrl.cli", "record", str(out), *named]
         with subprocess.Popen(command, stderr=subprocess.PIPE) as process:
             deadline = time.monotonic() + PATIENCE_S
-            # Not at a moment of the flight: how much is written by then depends on the machine.
-            while attitudes_in(partial, mended) < 100 and time.monotonic() < deadline:
+            # Wait for content instead of a time, because the progress depends on the machine.
+            while recover_attitudes(partial, mended) < 100 and time.monotonic() < deadline:
                 time.sleep(0.2)
             process.send_signal(signal.SIGKILL)
     assert not out.exists()
-    assert attitudes_in(partial, mended) >= 100  # of 290
+    assert recover_attitudes(partial, mended) >= 100  # of 290
     with pytest.raises(OutputError, match="cut off\\. Bring it back with dmrl recover"):
         record.run(out, [RobotOptions("cf1", "udp://127.0.0.1:9")], record.Settings())
 
@@ -239,7 +244,7 @@ def test_ctrl_c_leaves_a_whole_recording(flight: Path, tmp_path: Path) -> None:
 
         threading.Thread(target=interrupt, daemon=True).start()
         out = tmp_path / "out.mcap"
-        result = record.run(out, robots(fleet), record.Settings(duration_s=PATIENCE_S))
+        result = record.run(out, list_robots(fleet), record.Settings(duration_s=PATIENCE_S))
     assert sum(1 for _ in read(out, "/cf1/attitude")) == result.messages["/cf1/attitude"] >= 70
 
 
@@ -299,7 +304,7 @@ def test_missing_cflib_error_names_the_extra(
     ],
 )
 @pytest.mark.heavy
-def test_a_fleet_that_cannot_be_is_refused(
+def test_invalid_fleet_is_refused(
     flight: Path, uris: tuple[str, ...], cameras: tuple[int, ...], settings: dict, why: str
 ) -> None:
     with (

@@ -1,4 +1,4 @@
-"""Rendering to recordings, by Blender. Skips where that is not set up."""
+"""Rendering to recordings by Blender; skipped where Blender is not set up."""
 
 import os
 import signal
@@ -42,7 +42,7 @@ SMALL = Settings(
 
 @pytest.fixture(scope="module")
 def recording(blender: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Six images with up to three robots."""
+    """Return six images with up to three robots."""
     out = tmp_path_factory.mktemp("render") / "six.mcap"
     run(out, SMALL)
     return out
@@ -84,17 +84,18 @@ def test_masks_depths_and_labels_agree(recording: Path) -> None:
 @pytest.mark.slow
 def test_the_number_of_workers_changes_no_byte(recording: Path, tmp_path: Path) -> None:
     out = tmp_path / "two.mcap"
-    run(out, Settings(**{**_fields(SMALL), "workers": 2}))
+    run(out, Settings(**{**_get_fields(SMALL), "workers": 2}))
     assert out.read_bytes() == recording.read_bytes()
 
 
-def _fields(settings: Settings) -> dict[str, object]:
+def _get_fields(settings: Settings) -> dict[str, object]:
+    """Return the values of all settings by name."""
     return {name: getattr(settings, name) for name in Settings.__dataclass_fields__}
 
 
 @pytest.mark.slow
 def test_a_killed_run_goes_on_to_the_same_bytes(blender: Path, tmp_path: Path) -> None:
-    # Pictures without loss, so that chunks of the file fill and are written early.
+    # Lossless images are large, so that chunks fill up and are written early.
     recipe = tmp_path / "r.toml"
     recipe.write_text('kind = "render"\nimages = 24\nsamples = 1\nimage_format = "png"\n')
     whole, killed = tmp_path / "whole.mcap", tmp_path / "killed.mcap"
@@ -105,7 +106,7 @@ def test_a_killed_run_goes_on_to_the_same_bytes(blender: Path, tmp_path: Path) -
         while not (partial.exists() and partial.stat().st_size > 300_000):
             assert process.poll() is None, "it ended before it could be killed"
             time.sleep(0.01)
-        time.sleep(0.1)  # the labels of these images are written after them
+        time.sleep(0.1)  # labels are written after their images
         os.kill(process.pid, signal.SIGKILL)
     assert not killed.exists()
     again = subprocess.run([*command, str(killed)], capture_output=True, text=True, check=False)
@@ -159,12 +160,13 @@ def test_boxes_are_where_the_mesh_is(blender: Path) -> None:
         scenes = [draw_scene(world, k) for k in range(30)]
         shots = renderer.render_shots((camera, s.robots, s.look) for s in scenes)
         for scene, shot in zip(scenes, shots, strict=True):
-            errors.append(shot.box_px[0] - _mesh_box(scene.robots[0], camera))
+            errors.append(shot.box_px[0] - _project_mesh(scene.robots[0], camera))
     assert np.median(np.abs(errors)) < 0.5
     assert np.percentile(np.abs(errors), 90) < 1.5
 
 
-def _mesh_box(robot: Robot, camera: Camera) -> Array:
+def _project_mesh(robot: Robot, camera: Camera) -> Array:
+    """Return left, top, right and bottom of the projected mesh, pixels, clipped to the image."""
     turns = (robot.paint["rotor_first_rad"], robot.paint["rotor_sweep_rad"])
     points = crazyflie.outline_points(1.0, *turns)
     xyz = points @ robot.pose.camera_from_body.T + robot.pose.xyz_camera

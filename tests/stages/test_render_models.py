@@ -1,4 +1,4 @@
-"""Robot models of the user: readable files, and previews."""
+"""Robot models of the user: files that can be read, and previews."""
 
 import json
 from dataclasses import replace
@@ -25,7 +25,7 @@ from dmrl.stages.render import command, run
 CUBE = "".join(f"v {x} {y} {z}\n" for x in (0, 1) for y in (0, 1) for z in (0, 1)) + (
     "f 1 2 4 3\nf 5 7 8 6\nf 1 5 6 2\nf 3 4 8 7\nf 1 3 7 5\nf 2 6 8 4\n"
 )
-# 1 by 3 by 2; as .obj files are: y up.
+# A box of 1 x 3 x 2 with y up, as is usual in .obj files.
 TOWER = "".join(
     f"v {words[1]} {3 * int(words[2])} {2 * int(words[3])}\n" if words[0] == "v" else f"{line}\n"
     for line in CUBE.splitlines()
@@ -110,11 +110,12 @@ def test_the_box_of_a_preview_is_about_what_it_shows(
         rows, cols = np.nonzero(np.abs(side.rgb.astype(int) - side.rgb[0, 0]).max(axis=2) > 3)
         seen = [cols.min(), rows.min(), cols.max() + 1, rows.max() + 1]
         ends = side.edges_px.reshape(-1, 2)
-        # Where the camera looks at an edge, the outermost pixels are covered by a hair.
+        # Where an edge points at the camera, the outermost pixels are hardly covered.
         assert seen == pytest.approx([*ends.min(axis=0), *ends.max(axis=0)], abs=2.5)
     start, end = np.moveaxis(sides["from the front"].axes_px, 1, 0)
-    assert end[1, 0] > start[1, 0] + 50  # y to the left of the robot: to the right seen from before
-    assert end[2, 1] < start[2, 1] - 50  # z up
+    # Seen from the front, the left of the robot (y) is on the right, and z points up.
+    assert end[1, 0] > start[1, 0] + 50
+    assert end[2, 1] < start[2, 1] - 50
     start, end = np.moveaxis(sides["from its left"].axes_px, 1, 0)
     assert end[0, 0] < start[0, 0] - 50
     assert size_m == pytest.approx([0.1, 0.2, 0.3] if up == "y" else [0.1, 0.3, 0.2], abs=1e-6)
@@ -163,16 +164,16 @@ def test_a_model_of_the_user_s_is_rendered_about_its_middle(blender: Path, tmp_p
     cornered = tmp_path / "origin.mcap"
     origin = Settings(images=3, model=path, model_centre="origin", scale=0.1, samples=2)
     run(cornered, replace(origin, empty_share=0.0))
-    # The cube's own origin is a corner, half its diagonal from the middle.
-    assert _off_middle(out).max() < 15
-    assert _off_middle(cornered).min() > 5
+    # The origin of the cube is a corner, half its diagonal from the middle.
+    assert _measure_offsets(out).max() < 15
+    assert _measure_offsets(cornered).min() > 5
     with pytest.raises(SettingError, match=r"robots of 100 m.*Change --scale"):
         run(tmp_path / "big.mcap", Settings(images=3, model=path, scale=100.0, workers=1))
     assert not (tmp_path / "big.mcap").exists()
 
 
-def _off_middle(recording: Path) -> Array:
-    """Distance of labels from the middles of their boxes, pixels times metres."""
+def _measure_offsets(recording: Path) -> Array:
+    """Return the distances of labels from the middles of their boxes, pixels times metres."""
     off = []
     for peers in read_table(recording, "/cf1/labels")["peers"].to_pylist():
         for peer in peers:

@@ -1,4 +1,4 @@
-"""Runs of recipes: the report is redrawn, and steps repeated, only on changes."""
+"""A repeated run of a recipe repeats steps and redraws the report only after changes."""
 
 import json
 from pathlib import Path
@@ -41,11 +41,11 @@ def test_a_page_is_drawn_again_when_a_step_or_a_figure_has_changed(
     page.write_text("untouched")
     run.command(str(recipe), out=tmp_path / "out", workers=1)
     assert page.read_text() == "untouched"
-    # A page that was not written by dmrl is left alone, so it goes first.
+    # A page that dmrl did not write is never replaced, so remove it.
     page.unlink()
     run.command(str(recipe), out=tmp_path / "out", workers=1)
     assert "WORDS" in page.read_text() and "2 of 2 steps" in capsys.readouterr().err
-    # Figures alone have changed: no step is run, the page is another.
+    # Only a figure has changed: no step is run, but the page is redrawn.
     recipe.write_text(RECIPE.replace("WORDS", "last words"))
     run.command(str(recipe), out=tmp_path / "out", workers=1)
     assert "last words" in page.read_text() and "2 of 2 steps" in capsys.readouterr().err

@@ -1,3 +1,5 @@
+"""`dmrl sketch`: labelled images without Blender."""
+
 import csv
 import json
 from pathlib import Path
@@ -18,7 +20,7 @@ SMALL = Settings(images=12, seed=5, empty_share=0.3)
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Twelve pictures. To be read only."""
+    """Return a folder of twelve sketched images. Tests must not change it."""
     out = tmp_path_factory.mktemp("sketch") / "sketch"
     run(out, SMALL)
     return out

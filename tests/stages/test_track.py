@@ -1,3 +1,5 @@
+"""`dmrl track`: tracks and their evaluation."""
+
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -23,7 +25,7 @@ pytestmark = pytest.mark.heavy
 
 @pytest.fixture(scope="module")
 def detected(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Half a minute of three robots; what a network would have found from cf1."""
+    """Return a flight of three robots over 30 s with simulated detections of cf1."""
     folder = tmp_path_factory.mktemp("track")
     flight = folder / "flight.mcap"
     fly.run(flight, fly.Settings(3, 30.0, noise="calibrated", seed=11))
@@ -32,6 +34,7 @@ def detected(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def tracked(detected: Path) -> Path:
+    """Return the flight with tracks."""
     out = detected.with_name("tracked.mcap")
     track.run(detected, out, Settings())
     return out
@@ -39,7 +42,7 @@ def tracked(detected: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def judged(tracked: Path) -> dict[str, Any]:
-    """What an evaluation of the tracks says of their only observer."""
+    """Return the evaluation of the tracks of cf1, the only observer."""
     made = evaluate.run([tracked], None, evaluate.Settings(settle_s=3.0))
     assert isinstance(made, dict)
     (one,) = made["robots"]
@@ -97,7 +100,7 @@ def test_other_messages_stay_and_old_tracks_go(
 
 
 def test_recorded_detector_rates_are_used_by_the_tracker(detected: Path, tmp_path: Path) -> None:
-    """With rates of a detector whose detections are nearly all false, nobody is followed."""
+    """If the rates state that nearly all detections are false, no track is started."""
     told, out = tmp_path / "told.mcap", tmp_path / "out.mcap"
     rates = {
         "min_confidence": 0.2,

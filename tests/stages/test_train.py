@@ -1,3 +1,5 @@
+"""`dmrl train`: reproducibility, resumption, settings and errors."""
+
 import json
 import os
 import signal
@@ -124,7 +126,7 @@ step = trainer.train_step
 checkpoint = Path(sys.argv[2] + ".partial", "checkpoint.json")
 def until_the_first_checkpoint(*args):
     if checkpoint.exists():
-        time.sleep(1000)  # to be killed
+        time.sleep(1000)  # until it is killed
     return step(*args)
 trainer.train_step = until_the_first_checkpoint
 run(
@@ -135,8 +137,8 @@ run(
 """
 
 
-def check_that_it_goes_on(dataset: Path, out: Path, settings: Settings) -> None:
-    """Without --resume it is refused; with it, it ends as if nobody had stopped it."""
+def assert_training_resumes(dataset: Path, out: Path, settings: Settings) -> None:
+    """Assert that a training resumes, only on request, to the weights of an uninterrupted one."""
     partial, whole = out.with_name(f"{out.name}.partial"), out.with_name("whole")
     assert partial.is_dir()
     assert not out.exists()
@@ -155,15 +157,15 @@ def test_interrupted_training_resumes_to_the_same_bytes(
     out = tmp_path / "run"
     steps, step = count(), trainer.train_step
 
-    def interrupted(*args: Any) -> Any:
-        if next(steps) == 7:  # of the five that an epoch has, the third of the second
+    def interrupt(*args: Any) -> Any:
+        if next(steps) == 7:  # the third of five steps of the second epoch
             raise KeyboardInterrupt
         return step(*args)
 
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(trainer, "train_step", interrupted)
+        patch.setattr(trainer, "train_step", interrupt)
         run(dots_dataset, out, SETTINGS)
-    check_that_it_goes_on(dots_dataset, out, SETTINGS)
+    assert_training_resumes(dots_dataset, out, SETTINGS)
 
 
 @pytest.mark.parametrize("began", [False, True])
@@ -193,7 +195,7 @@ def test_killed_training_resumes_to_the_same_bytes(dots_dataset: Path, tmp_path:
         time.sleep(0.02)
     os.kill(process.pid, signal.SIGKILL)
     process.wait()
-    check_that_it_goes_on(dots_dataset, out, settings)
+    assert_training_resumes(dots_dataset, out, settings)
 
 
 def test_a_training_killed_in_its_first_epoch_starts_over(
@@ -333,4 +335,4 @@ def test_json_names_the_model(
     train.command(dots_dataset, tmp_path / "run", flags=Flags(epochs=1, device="cpu"), as_json=True)
     output = json.loads(capsys.readouterr().out)
     assert output["model"] == str(tmp_path / "run")
-    assert output["images"] == 18  # two are held out, to choose the threshold on
+    assert output["images"] == 18  # two are held out for the choice of the threshold

@@ -35,7 +35,7 @@ def test_two_processes_train_one_network(dots_dataset: Path, tmp_path: Path) -> 
     assert first == second
     run(dots_dataset, tmp_path / "alone", settings)
     histories = [load_model(tmp_path / n).training["history"] for n in ("a", "alone")]
-    # The same batches, but other augmentation and statistics of half a batch each.
+    # Batches are equal, but the augmentation differs, and statistics are of half a batch each.
     assert histories[0][-1]["loss"] == pytest.approx(histories[1][-1]["loss"], rel=0.3)
     assert histories[0][-1]["loss"] != histories[1][-1]["loss"]
 

@@ -1,4 +1,4 @@
-"""Training on a flight without labels: the consistency loss lowers the error in that place."""
+"""Training on unlabelled flights: the consistency loss lowers the error in their rooms."""
 
 import json
 from dataclasses import replace
@@ -17,15 +17,15 @@ from dmrl.stages.fly import Flags, Settings
 PLACES = 641, 642, 643, 644
 
 
-def record(out: Path, place: int, seed: int, **flags: float) -> Path:
-    """Fly in a place; another seed flies another path there."""
+def fly_in_place(out: Path, place: int, seed: int, **flags: float) -> Path:
+    """Fly in a room; the seed sets the path."""
     wanted = Flags(seed=seed, place=place, eye="ideal", camera_renderer="sketch", **flags)
     fly.run(out, recipes.load("fly_follow", "fly", Settings, wanted))
     return out
 
 
 def make_dataset(folder: Path, images: int) -> Path:
-    """Draw labelled pictures of other places."""
+    """Make a dataset of sketched images of other rooms."""
     sketch.run(folder / "pictures", sketch.Settings(images=images, empty_share=0.4, seed=5))
     convert.run(folder / "pictures", folder / "pictures.mcap", convert.Settings())
     dataset.run([folder / "pictures.mcap"], folder / "set", dataset.Settings(split="none"))
@@ -33,7 +33,7 @@ def make_dataset(folder: Path, images: int) -> Path:
 
 
 def measure_depth_error(model: Path, flight: Path, out: Path) -> float:
-    """Return the mean absolute depth error of the leaders that are found, metres."""
+    """Return the mean absolute depth error of the leaders that are detected, metres."""
     predict.run(model, flight, out, predict.Settings())
     errors = []
     for label, found in zip(read(out, "/cf1/labels"), read(out, "/cf1/detections"), strict=True):
@@ -48,8 +48,8 @@ def measure_depth_error(model: Path, flight: Path, out: Path) -> float:
 @pytest.mark.slow
 @pytest.mark.timeout(900)
 def test_a_flight_without_labels_lowers_the_depth_error_in_its_place(tmp_path: Path) -> None:
-    flown = [record(tmp_path / f"{place}.mcap", place, 1) for place in PLACES]
-    judged = record(tmp_path / "judged.mcap", PLACES[1], 11)
+    flown = [fly_in_place(tmp_path / f"{place}.mcap", place, 1) for place in PLACES]
+    judged = fly_in_place(tmp_path / "judged.mcap", PLACES[1], 11)
     data = make_dataset(tmp_path, 300)
     settings = replace(
         recipes.load("own_camera", "train", TrainConfig),
@@ -71,7 +71,7 @@ def test_a_flight_without_labels_lowers_the_depth_error_in_its_place(tmp_path: P
 @pytest.mark.heavy
 def test_flights_without_labels_are_inputs_and_need_detections(tmp_path: Path) -> None:
     data = make_dataset(tmp_path, 8)
-    flight = record(tmp_path / "flight.mcap", 1, 1, duration_s=2.0)
+    flight = fly_in_place(tmp_path / "flight.mcap", 1, 1, duration_s=2.0)
     settings = TrainConfig(epochs=1, batch_size=8)
     train.run(data, tmp_path / "model", settings, unlabelled=[flight])
     inputs = read_provenance(tmp_path / "model")

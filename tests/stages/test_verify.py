@@ -1,3 +1,5 @@
+"""`dmrl verify` compares generated C code with the reference."""
+
 import json
 import shutil
 from dataclasses import replace
@@ -27,8 +29,10 @@ SEED = 3
 GCC = Settings(targets=("gcc",), images=2, noise=1)
 
 
-def export(network: IntegerNetwork, folder: Path, carries: IntegerNetwork | None = None) -> Path:
-    """An export folder; its C may carry another network than it says."""
+def write_export(
+    network: IntegerNetwork, folder: Path, carries: IntegerNetwork | None = None
+) -> Path:
+    """Write an export folder; its C code may be that of another network, ``carries``."""
     folder.mkdir()
     write_c(carries or network, folder, [])
     save_network(network, folder / INTEGER_NAME)
@@ -37,8 +41,8 @@ def export(network: IntegerNetwork, folder: Path, carries: IntegerNetwork | None
     return folder
 
 
-def changed(network: IntegerNetwork) -> IntegerNetwork:
-    """The same network but for one bias of its last convolution."""
+def change_bias(network: IntegerNetwork) -> IntegerNetwork:
+    """Return the network with one bias of its last convolution changed."""
     last = network.layers[-1]
     assert isinstance(last, Conv)
     bias = last.bias.copy()
@@ -48,57 +52,59 @@ def changed(network: IntegerNetwork) -> IntegerNetwork:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return export(random_network(SEED), tmp_path_factory.mktemp("verify") / "export")
+    """Return the export of a small random network."""
+    return write_export(random_network(SEED), tmp_path_factory.mktemp("verify") / "export")
 
 
 @pytest.fixture(scope="module")
-def everything(folder: Path) -> dict[str, Any]:
+def results(folder: Path) -> dict[str, Any]:
+    """Return the results of all targets, or skip where a tool is missing."""
     if absent := [tool for tool in TOOLS if shutil.which(tool) is None]:
         pytest.skip(f"no {absent[0]}")
     return run(folder, Settings(images=2, noise=2)).to_document()
 
 
 @pytest.mark.slow
-def test_every_target_equals_the_reference(everything: dict[str, Any]) -> None:
-    assert [t["target"] for t in everything["targets"]] == ["gcc", "clang", "sanitizers", "riscv32"]
-    assert all(t["mismatches"] == 0 for t in everything["targets"])
-    assert not any(t["skipped"] or t["error"] for t in everything["targets"])
-    assert (everything["images"], everything["noise_images"]) == (2, 2)
+def test_every_target_equals_the_reference(results: dict[str, Any]) -> None:
+    assert [t["target"] for t in results["targets"]] == ["gcc", "clang", "sanitizers", "riscv32"]
+    assert all(t["mismatches"] == 0 for t in results["targets"])
+    assert not any(t["skipped"] or t["error"] for t in results["targets"])
+    assert (results["images"], results["noise_images"]) == (2, 2)
 
 
 @pytest.mark.slow
-def test_code_size_stack_and_instructions_are_measured(everything: dict[str, Any]) -> None:
-    assert 500 < everything["code_bytes"] < 50_000
-    assert 0 < everything["stack_bytes"] <= MAX_STACK_BYTES
-    # A multiplication and an addition at the least; small layers cost more around them.
-    assert 2 < everything["instructions_per_mac"] < 60
-    assert [e["images_per_s"] > 0 for e in everything["gap8_estimates"]] == [True, True]
-    assert all("175 MHz" in e["assuming"] for e in everything["gap8_estimates"])
+def test_code_size_stack_and_instructions_are_measured(results: dict[str, Any]) -> None:
+    assert 500 < results["code_bytes"] < 50_000
+    assert 0 < results["stack_bytes"] <= MAX_STACK_BYTES
+    # At least a multiplication and an addition. Small layers have more overhead.
+    assert 2 < results["instructions_per_mac"] < 60
+    assert [e["images_per_s"] > 0 for e in results["gap8_estimates"]] == [True, True]
+    assert all("175 MHz" in e["assuming"] for e in results["gap8_estimates"])
 
 
 @pytest.mark.slow
 def test_counting_instructions_gives_the_same_number_again(
-    everything: dict[str, Any], folder: Path
+    results: dict[str, Any], folder: Path
 ) -> None:
     again = run(folder, replace(GCC, targets=())).to_document()
-    assert again["instructions"] == everything["instructions"]
+    assert again["instructions"] == results["instructions"]
 
 
 @pytest.fixture
-def one_level(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The C is compiled once and its cost not counted: the slow tests do all of that."""
+def single_compilation(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Compile at one level and skip the cost measurement, which the slow tests do."""
     monkeypatch.setattr(compile_targets, "OPTIMIZATION_LEVELS", ("-O0",))
     monkeypatch.setattr(measure, "measure_cost", lambda *_: ExecutionCost())
 
 
 @pytest.mark.heavy
 @needs_gcc
-@pytest.mark.usefixtures("one_level")
+@pytest.mark.usefixtures("single_compilation")
 def test_c_of_another_network_is_detected(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     network = random_network(SEED)
-    wrong = export(network, tmp_path / "export", carries=changed(network))
+    wrong = write_export(network, tmp_path / "export", carries=change_bias(network))
     assert app(["verify", str(wrong), "--targets", "gcc", "--json"], result_action="return_value")
     (gcc,) = json.loads(capsys.readouterr().out)["targets"]
     assert gcc["mismatches"] > 0
@@ -107,13 +113,13 @@ def test_c_of_another_network_is_detected(
 
 @pytest.mark.heavy
 @needs_gcc
-@pytest.mark.usefixtures("one_level")
+@pytest.mark.usefixtures("single_compilation")
 def test_a_proof_is_written_only_where_the_c_is_right(folder: Path, tmp_path: Path) -> None:
     out = tmp_path / "proof.json"
     run(folder, GCC, out)
     assert json.loads(out.read_text())["targets"][0]["mismatches"] == 0
     network = random_network(SEED)
-    wrong = export(network, tmp_path / "export", carries=changed(network))
+    wrong = write_export(network, tmp_path / "export", carries=change_bias(network))
     with pytest.raises(ToolError, match=r"gcc: \d+ images differ from the reference"):
         run(wrong, GCC, tmp_path / "lie.json")
     assert sorted(p.name for p in tmp_path.glob("*.json*")) == ["proof.json"]

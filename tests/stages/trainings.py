@@ -1,4 +1,4 @@
-"""Settings of the shortest training."""
+"""Settings of a short training."""
 
 from dmrl.stages.train import Settings
 
