@@ -14,34 +14,34 @@ from dmrl.rendering import blender_environment
 
 REPOSITORY = Path(__file__).parents[1]
 
-# What is imported stays: Python need not look through all of it for garbage, again and again.
+# Imported modules are never freed. Without this, garbage collection scans them again and again.
 gc.disable()
 
 
 def pytest_collection_finish() -> None:
-    """From the first test on garbage is collected, among what the tests make."""
+    """Exclude the imported modules from garbage collection, and switch it on for the tests."""
     gc.freeze()
     gc.enable()
 
 
-# A command that a test runs in this process has a temporary folder, which is removed before
-# multiprocessing removes its own. So that one is not to be in there.
+# A command that runs in this process removes its own temporary folder at the end. The folder of
+# multiprocessing is removed later and must therefore lie elsewhere.
 multiprocessing.util.get_temp_dir()
 
-# A shell that starts the tests in the background has them and all they start ignore Ctrl-C, which
-# some of them send.
+# A shell makes its background jobs, and the processes that they start, ignore SIGINT. Some tests
+# send SIGINT to such processes.
 if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
-# On a machine that is busy an example may take long; a test that hangs ends by pytest-timeout.
-# The same few examples every time: a failure is one that everybody sees, and costs little.
+# No deadline: an example may take long on a busy machine. pytest-timeout ends a test that hangs.
+# A few fixed examples keep the tests fast, and every machine sees the same failures.
 settings.register_profile("dmrl", deadline=None, derandomize=True, max_examples=25)
 settings.load_profile("dmrl")
 
 
 @pytest.fixture(scope="session")
 def data() -> Path:
-    """Real data: the published set, weights, frames, logs. Skips where they are absent."""
+    """Return the folder of real data: the published set, weights, frames and logs; or skip."""
     folder = Path(os.environ.get("DMRL_DATA", REPOSITORY.parent / "shared" / "data"))
     if not folder.is_dir():
         pytest.skip("no real data; set DMRL_DATA to the folder that holds it")
@@ -50,7 +50,7 @@ def data() -> Path:
 
 @pytest.fixture(scope="session")
 def blender() -> Path:
-    """Python of Blender's environment. Skips where it is not set up."""
+    """Return the Python of Blender's environment, or skip where it is not set up."""
     python = blender_environment.find_python()
     if python is None:
         pytest.skip("Blender is not set up; run: dmrl render --setup")
@@ -59,7 +59,7 @@ def blender() -> Path:
 
 @pytest.fixture
 def empty_figures(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Figures are made and written where they belong, but without a stroke: that takes long."""
+    """Make figures write empty files, because drawing them takes long."""
     style = pytest.importorskip("dmrl.plots.style")
 
     def savefig(_: object, path: Path, **__: object) -> None:

@@ -1,4 +1,4 @@
-"""Hash the decoded outputs of the main commands on fixed inputs, to hold them while code moves.
+"""Hash the decoded outputs of the main commands on fixed inputs, to detect changes of behaviour.
 
     make golden                  compare with tests/golden.json
     make golden ARGS="--write"   write tests/golden.json again
@@ -115,7 +115,7 @@ def iter_parts(path: Path) -> Iterator[bytes]:
     elif path.suffix == ".json":
         yield json.dumps(drop_volatile(json.loads(path.read_text()))).encode()
     elif path.suffix in (".npz", ".svg", ".onnx", ".md", ".html"):
-        yield b""  # words, drawings and containers with times; their data is hashed elsewhere
+        yield b""  # these contain times or prose; the data behind them is hashed in other files
     else:
         yield path.read_bytes()
 

@@ -1,4 +1,4 @@
-"""Small wrong changes to code: which there are, and which of them a seed draws."""
+"""Small wrong changes to source code, and their random selection."""
 
 import ast
 import random
@@ -12,7 +12,7 @@ from pathlib import Path
 
 REPOSITORY = Path(__file__).parents[1]
 NAMED = Path(__file__).with_name("mutants.toml")
-"""Changes that people made by hand: what an outsider would break."""
+"""Hand-written changes: mistakes that a newcomer might make."""
 
 OTHER: dict[type, tuple[type, ...]] = {
     **{ast.Lt: (ast.LtE, ast.Gt), ast.LtE: (ast.Lt, ast.GtE)},
@@ -23,14 +23,14 @@ OTHER: dict[type, tuple[type, ...]] = {
     **{ast.Mod: (ast.FloorDiv,), ast.Pow: (ast.Mult,), ast.BitAnd: (ast.BitOr,)},
     **{ast.BitOr: (ast.BitAnd,), ast.LShift: (ast.RShift,), ast.RShift: (ast.LShift,)},
 }
-"""What takes the place of an operator."""
+"""The operators that replace an operator."""
 IN_ANY_ORDER = ("min", "max", "minimum", "maximum", "hypot", "logical_and", "logical_or", "equal")
-"""Functions that give the same whichever argument comes first."""
+"""Functions whose result does not depend on the order of their arguments."""
 
 
 @dataclass(frozen=True, slots=True)
 class Mutant:
-    """One change: ``before``, bytes ``start`` to ``end`` of a file, becomes ``after``."""
+    """A change that replaces ``before``, bytes ``start`` to ``end`` of a file, by ``after``."""
 
     path: str
     line: int
@@ -41,9 +41,9 @@ class Mutant:
     after: str
 
 
-def changes(tree: ast.AST) -> Iterator[tuple[str, ast.expr | ast.stmt, ast.AST]]:
-    """Kind of each change, what is changed, and what takes its place."""
-    for node in _code(tree):
+def iter_changes(tree: ast.AST) -> Iterator[tuple[str, ast.expr | ast.stmt, ast.AST]]:
+    """Yield the kind of each change, the node that is changed, and its replacement."""
+    for node in _iter_mutable(tree):
         if isinstance(node, ast.Compare):
             for k, operator in enumerate(node.ops):
                 for other in OTHER[type(operator)]:
@@ -51,7 +51,7 @@ def changes(tree: ast.AST) -> Iterator[tuple[str, ast.expr | ast.stmt, ast.AST]]
                     changed.ops[k] = other()
                     yield "comparison", node, changed
         elif isinstance(node, ast.BinOp) and not _is_text(node):
-            yield from _of_arithmetic(node)
+            yield from _change_arithmetic(node)
         elif isinstance(node, ast.BoolOp):
             for k in range(len(node.values)):
                 rest = node.values[:k] + node.values[k + 1 :]
@@ -68,10 +68,11 @@ def changes(tree: ast.AST) -> Iterator[tuple[str, ast.expr | ast.stmt, ast.AST]]
             elif isinstance(node.value, float):
                 yield "constant", node, ast.Constant(2 * node.value or 1.0)
         else:
-            yield from _swapped(node)
+            yield from _swap_neighbours(node)
 
 
-def _of_arithmetic(node: ast.BinOp) -> Iterator[tuple[str, ast.expr, ast.AST]]:
+def _change_arithmetic(node: ast.BinOp) -> Iterator[tuple[str, ast.expr, ast.AST]]:
+    """Yield an operation with another operator, without one term, and with the other sign."""
     for other in OTHER.get(type(node.op), ()):
         yield "arithmetic", node, ast.BinOp(node.left, other(), node.right)
     if isinstance(node.op, ast.Add | ast.Sub):
@@ -81,8 +82,8 @@ def _of_arithmetic(node: ast.BinOp) -> Iterator[tuple[str, ast.expr, ast.AST]]:
         yield "sign", node, ast.UnaryOp(ast.USub(), node)
 
 
-def _swapped(node: ast.AST) -> Iterator[tuple[str, ast.expr, ast.AST]]:
-    """Calls, and lists of values, with two neighbours swapped."""
+def _swap_neighbours(node: ast.AST) -> Iterator[tuple[str, ast.expr, ast.AST]]:
+    """Yield a call, a tuple or a list with two neighbouring values swapped."""
     if isinstance(node, ast.Call):
         if getattr(node.func, "id", getattr(node.func, "attr", "")) in IN_ANY_ORDER:
             return
@@ -105,7 +106,7 @@ def _swapped(node: ast.AST) -> Iterator[tuple[str, ast.expr, ast.AST]]:
 
 
 def _is_text(node: ast.BinOp) -> bool:
-    """Whether an operator joins text or lists, as far as one can see."""
+    """Return whether an operand is literally text, a list or a tuple."""
     kinds = (ast.JoinedStr, ast.List, ast.Tuple)
     return any(
         isinstance(n, kinds) or (isinstance(n, ast.Constant) and isinstance(n.value, str))
@@ -113,15 +114,15 @@ def _is_text(node: ast.BinOp) -> bool:
     )
 
 
-def _code(node: ast.AST) -> Iterator[ast.AST]:
-    """What is computed: no annotations, no text, no words of an error."""
+def _iter_mutable(node: ast.AST) -> Iterator[ast.AST]:
+    """Yield the nodes that compute something: no annotations, f-strings or raised errors."""
     if isinstance(node, ast.JoinedStr | ast.Raise):
         return
     if isinstance(node, ast.keyword) and node.arg == "strict":
-        return  # of zip: says only that what is so is so
+        return  # zip(strict=True) only asserts equal lengths, so no test can fail without it
     yield node
     for name, value in ast.iter_fields(node):
-        if isinstance(node, ast.Call) and _is_left_open(node, name):
+        if isinstance(node, ast.Call) and _is_reshape_length(node, name):
             continue
         if name in ("annotation", "returns", "decorator_list", "pattern"):
             continue
@@ -129,22 +130,25 @@ def _code(node: ast.AST) -> Iterator[ast.AST]:
             continue
         for child in value if isinstance(value, list) else [value]:
             if isinstance(child, ast.AST):
-                yield from _code(child)
+                yield from _iter_mutable(child)
 
 
-def _is_left_open(node: ast.Call, field: str) -> bool:
-    """Whether these are the lengths of a reshape: any negative one is the one not given."""
+def _is_reshape_length(node: ast.Call, field: str) -> bool:
+    """Return whether a field holds the lengths of a reshape.
+
+    NumPy infers any negative length, so that changing -1 to -2 has no effect.
+    """
     return field == "args" and isinstance(node.func, ast.Attribute) and node.func.attr == "reshape"
 
 
-def mutants_of(path: Path) -> list[Mutant]:
-    """Every change of a file."""
+def list_mutants(path: Path) -> list[Mutant]:
+    """Return every change of a file."""
     source = path.read_bytes()
     starts = [0]
     for line in source.splitlines(keepends=True):
         starts.append(starts[-1] + len(line))
     found = []
-    for kind, node, changed in changes(ast.parse(source)):
+    for kind, node, changed in iter_changes(ast.parse(source)):
         assert node.end_lineno is not None and node.end_col_offset is not None
         start = starts[node.lineno - 1] + node.col_offset
         end = starts[node.end_lineno - 1] + node.end_col_offset
@@ -157,13 +161,13 @@ def mutants_of(path: Path) -> list[Mutant]:
     return found
 
 
-def drawn(room: str, count: int, seed: int, without: tuple[str, ...]) -> list[Mutant]:
-    """Some changes of a room's code, each kind as often as the others."""
+def draw_mutants(room: str, count: int, seed: int, without: tuple[str, ...]) -> list[Mutant]:
+    """Return ``count`` random changes of a package's code, each kind equally often."""
     rng = random.Random(f"{room} {seed}")
     by_kind: dict[str, list[Mutant]] = defaultdict(list)
     for path in sorted((REPOSITORY / "dmrl" / room).rglob("*.py")):
         if path.stem not in without:
-            for mutant in mutants_of(path):
+            for mutant in list_mutants(path):
                 by_kind[mutant.kind].append(mutant)
     for mutants in by_kind.values():
         rng.shuffle(mutants)
@@ -173,14 +177,17 @@ def drawn(room: str, count: int, seed: int, without: tuple[str, ...]) -> list[Mu
     return chosen[:count]
 
 
-def named(rooms: tuple[str, ...] = ()) -> tuple[list[tuple[Mutant, tuple[str, ...]]], list[str]]:
-    """The changes made by hand, each with the tests that should notice; of some rooms or all.
+def load_named_mutants(
+    rooms: tuple[str, ...] = (),
+) -> tuple[list[tuple[Mutant, tuple[str, ...]]], list[str]]:
+    """Return the hand-written changes with their tests, and one line per inapplicable change.
 
-    And what can no longer be changed: it does not stand in its file, or stands there twice.
+    A change is inapplicable if its text occurs in its file never or more than once. Without
+    ``rooms``, the changes of all packages are returned.
     """
     found, gone = [], []
     for where, changes in tomllib.loads(NAMED.read_text()).items():
-        room = room_of(where)
+        room = find_room(where)
         mirror = Path("tests", *Path(where).parts[1:-1], f"test_{Path(where).stem}.py")
         tests = changes.pop("tests", [str(mirror)])
         file = REPOSITORY / where
@@ -195,26 +202,26 @@ def named(rooms: tuple[str, ...] = ()) -> tuple[list[tuple[Mutant, tuple[str, ..
     return found, gone
 
 
-def files_of(room: str) -> list[Path]:
-    """The files of a room's tests."""
+def list_test_files(room: str) -> list[Path]:
+    """Return the test files of a package."""
     return sorted((REPOSITORY / "tests" / room).rglob("test_*.py"))
 
 
-def near(mutant: Mutant) -> list[str]:
-    """Files of tests that may notice, where nobody measured which tests run a line.
+def find_tests(mutant: Mutant) -> list[str]:
+    """Return test files that may detect a change, without measuring which tests execute it.
 
-    The module's own, then those that name it, small ones first; of a module that none names, all
-    of the room. Fewer than those that run the line: what they let pass, another may notice.
+    The module's own test file comes first, then those that name the module, small files first. For
+    a module that no test file names, all test files of the package are returned.
     """
     path = Path(mutant.path)
     module = re.escape(".".join(path.with_suffix("").parts))
     names = re.compile(rf"\b({module}|{path.stem})\b")
-    files = sorted(files_of(room_of(mutant.path)), key=lambda file: file.stat().st_size)
+    files = sorted(list_test_files(find_room(mutant.path)), key=lambda file: file.stat().st_size)
     own = [file for file in files if file.stem == f"test_{path.stem}"]
     others = [file for file in files if file not in own and names.search(file.read_text())]
     return [str(file.relative_to(REPOSITORY)) for file in (own + others) or files]
 
 
-def room_of(path: str) -> str:
-    """The folder of `dmrl/` that a file is in; empty for one at the top."""
+def find_room(path: str) -> str:
+    """Return the folder of `dmrl/` that holds a file; empty for a file directly in `dmrl/`."""
     return path.split("/")[1] if path.count("/") > 1 else ""

@@ -23,7 +23,7 @@ from dmrl.atomic_output import (
 from dmrl.errors import OutputError
 
 PATIENCE_S = 120.0
-"""How long a process may take on a machine that is busy."""
+"""Time limit of a process, with a margin for a busy machine."""
 
 
 def test_a_file_takes_its_name_when_the_block_ends(tmp_path: Path) -> None:
@@ -154,8 +154,8 @@ WRITER = (
 
 
 @contextmanager
-def _writing(kind: str, out: Path, word: str) -> Iterator[subprocess.Popen[str]]:
-    """Another process that writes ``out`` until its standard input is closed."""
+def _start_writer(kind: str, out: Path, word: str) -> Iterator[subprocess.Popen[str]]:
+    """Start another process that writes ``out`` until its standard input is closed."""
     with subprocess.Popen(
         [sys.executable, "-c", WRITER, kind, str(out), word],
         stdin=subprocess.PIPE,
@@ -178,7 +178,7 @@ def test_second_concurrent_writer_gets_one_line_error(
     kind: str, stopped: bool, tmp_path: Path
 ) -> None:
     out = tmp_path / "out"
-    with _writing(kind, out, "mine") as first:
+    with _start_writer(kind, out, "mine") as first:
         assert first.stdout is not None
         assert first.stdout.readline() == "begun\n"
         if stopped:
@@ -222,13 +222,13 @@ def test_one_of_many_writers_succeeds_with_complete_output(kind: str, tmp_path: 
 @KINDS
 def test_partial_file_of_a_killed_writer_blocks_no_other(kind: str, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    with _writing(kind, out, "half") as first:
+    with _start_writer(kind, out, "half") as first:
         assert first.stdout is not None
         first.stdout.readline()
         first.kill()
         first.wait()
     assert [path.name for path in tmp_path.iterdir()] == ["out.partial"]
-    with _writing(kind, out, "whole") as second:
+    with _start_writer(kind, out, "whole") as second:
         second.communicate("", timeout=PATIENCE_S)
     assert second.returncode == 0
     assert [path.name for path in tmp_path.iterdir()] == ["out"]

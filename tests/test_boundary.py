@@ -1,4 +1,4 @@
-"""The end of a command: one line and an exit status in every case."""
+"""Errors and signals end a command with one line on standard error and an exit status."""
 
 import errno
 import os
@@ -17,10 +17,12 @@ from dmrl.errors import OutputError
 
 DMRL = [sys.executable, "-m", "dmrl.cli"]
 PATIENCE_S = 120.0
-"""How long a process may take to start, or to end, on a machine that is busy."""
+"""Time limit for a process to start or to end, with a margin for a busy machine."""
 
 
-def _end_of(error: BaseException) -> int:
+def _raise_in_command(error: BaseException) -> int:
+    """Return the exit status of a command that raises an error."""
+
     def fail() -> None:
         raise error
 
@@ -32,7 +34,7 @@ def test_internal_error_gives_one_line_with_the_traceback_file(
 ) -> None:
     monkeypatch.delenv("DMRL_DEBUG", raising=False)
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
-    assert _end_of(KeyError("a\nb")) == 1
+    assert _raise_in_command(KeyError("a\nb")) == 1
     output = capsys.readouterr().err
     assert output.count("\n") == 1
     assert output.startswith("dmrl: internal error, KeyError: ")
@@ -48,7 +50,7 @@ def test_internal_error_keeps_its_traceback_in_debug_mode(
 ) -> None:
     monkeypatch.setenv("DMRL_DEBUG", "1")
     with pytest.raises(ZeroDivisionError):
-        _end_of(ZeroDivisionError())
+        _raise_in_command(ZeroDivisionError())
 
 
 @pytest.mark.parametrize(
@@ -67,7 +69,7 @@ def test_os_error_gives_one_line_error(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.delenv("DMRL_DEBUG", raising=False)
-    assert _end_of(error) == 1
+    assert _raise_in_command(error) == 1
     output = capsys.readouterr().err
     assert words in output
     assert output.count("\n") == 1
@@ -90,7 +92,7 @@ def test_signal_reports_that_no_output_is_complete(number: signal.Signals, tmp_p
         command,
         stderr=subprocess.PIPE,
         text=True,
-        # A shell starts its background jobs deaf to it, and children inherit that.
+        # A shell makes its background jobs ignore SIGINT, and their children inherit that.
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     ) as process:
         try:
@@ -157,7 +159,6 @@ def test_no_file_is_opened_as_a_closed_standard_stream(tmp_path: Path) -> None:
 
 @pytest.mark.heavy
 def test_command_runs_without_home_temp_folder_or_locale(tmp_path: Path) -> None:
-    """No home, no temporary folder, no language."""
     out = tmp_path / "out"
     environment = {"PATH": os.environ["PATH"], "TMPDIR": "/nonexistent"}
     command = [*DMRL, "sketch", str(out), "--images", "2"]
@@ -182,7 +183,7 @@ import sys
 sys.argv = ["dmrl", *sys.argv[1:]]
 from dmrl.__main__ import main
 
-class Announcer:  # of the first import within main: before it no code of dmrl can hear a signal
+class Announcer:  # prints at the first import within main: no earlier code can handle a signal
     def find_spec(self, *_):
         sys.meta_path.remove(self)
         print("begun", flush=True)
@@ -199,7 +200,7 @@ main()
 def test_ctrl_c_gives_one_line_and_status_130(
     words: list[str], longest_s: float, tmp_path: Path
 ) -> None:
-    """At 15 moments of each: while modules are imported, and after."""
+    """Each command is interrupted at 15 moments, during its imports and after them."""
     app(["sketch", str(tmp_path / "p"), "--images", "20"], result_action="return_value")
     for source, out in (("p", "a.mcap"), ("a.mcap", "dataset")):
         name = "dataset" if out == "dataset" else "convert"
@@ -218,7 +219,7 @@ def test_ctrl_c_gives_one_line_and_status_130(
             time.sleep(0.02 + longest_s * k / 15)
             process.send_signal(signal.SIGINT)
             _, output = process.communicate(timeout=PATIENCE_S)
-        if process.returncode or words[0] == "train":  # info may have ended before
+        if process.returncode or words[0] == "train":  # info may have ended before the signal
             ended.append((process.returncode, output.replace("dmrl: loading torch\n", "")))
             ended[-1] = (ended[-1][0], ended[-1][1].replace("loading torch\n", ""))
     assert ended and {status for status, _ in ended} == {130}

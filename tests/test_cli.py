@@ -1,4 +1,4 @@
-"""The command line as a whole: help, exit status, errors in one line."""
+"""The command line as a whole: help, exit status and one-line errors."""
 
 import ast
 import io
@@ -31,8 +31,8 @@ OPTIONAL = (
 STAGES = Path(cli.__file__).parent / "stages"
 
 
-def dmrl(*arguments: str) -> subprocess.CompletedProcess[str]:
-    """The command, run as a user runs it."""
+def run_dmrl(*arguments: str) -> subprocess.CompletedProcess[str]:
+    """Run the command in a process of its own."""
     command = [sys.executable, "-m", "dmrl.cli", *arguments]
     return subprocess.run(command, capture_output=True, text=True, check=False)
 
@@ -53,7 +53,7 @@ def test_help_and_version_load_nothing_heavy(arguments: list[str]) -> None:
 
 @pytest.mark.heavy
 def test_version_is_the_package_s() -> None:
-    done = dmrl("--version")
+    done = run_dmrl("--version")
     assert (done.returncode, done.stdout.strip(), done.stderr) == (0, __version__, "")
 
 
@@ -136,21 +136,21 @@ for name in COMMANDS:
     said[name] = status, out.getvalue(), err.getvalue(), sorted(packages), spent_s
 print(json.dumps(said))
 """
-Said = tuple[int, str, str, list[str], float]
-"""Exit status, output and errors of a command's help, packages that are loaded, CPU seconds."""
+Result = tuple[int, str, str, list[str], float]
+"""Exit status, standard output and error of a command's help, loaded packages, CPU seconds."""
 
 
 @pytest.fixture(scope="module")
-def light() -> dict[str, Said]:
-    """Every command's help as `main` prints it, in one process."""
+def results() -> dict[str, Result]:
+    """Return the help of every command as `main` prints it, all in one process."""
     script = [sys.executable, "-c", HELP_OF_EACH]
     done = subprocess.run(script, capture_output=True, text=True, check=True)
     return dict(json.loads(done.stdout))
 
 
 @pytest.fixture(scope="module")
-def bare() -> dict[str, Said]:
-    """The same where no extra is installed."""
+def results_without_extras() -> dict[str, Result]:
+    """Return the help of every command as printed where no extra is installed."""
     hide = f"import sys\nsys.modules.update(dict.fromkeys({OPTIONAL}))\n"
     script = [sys.executable, "-c", hide + HELP_OF_EACH]
     done = subprocess.run(script, capture_output=True, text=True, check=True)
@@ -160,9 +160,9 @@ def bare() -> dict[str, Said]:
 @pytest.mark.parametrize("name", COMMANDS)
 @pytest.mark.heavy
 def test_help_loads_no_package_that_only_the_command_needs(
-    name: str, light: dict[str, Said]
+    name: str, results: dict[str, Result]
 ) -> None:
-    mine = {package for package in light[name][3] if not package.startswith("_")}
+    mine = {package for package in results[name][3] if not package.startswith("_")}
     assert mine <= {
         "dmrl",
         "cyclopts",
@@ -177,26 +177,25 @@ def test_help_loads_no_package_that_only_the_command_needs(
 
 @pytest.mark.parametrize("name", COMMANDS)
 @pytest.mark.heavy
-def test_help_of_a_command_is_quick(name: str, light: dict[str, Said]) -> None:
-    """0.35 s of CPU for the first, which loads the command line; here less for each."""
-    assert light[name][4] < 0.35
+def test_help_of_a_command_is_quick(name: str, results: dict[str, Result]) -> None:
+    """The first command also pays for the import of the command line: all share a process."""
+    assert results[name][4] < 0.35
 
 
 @pytest.mark.parametrize("name", COMMANDS)
 @pytest.mark.heavy
-def test_help_needs_no_extra(name: str, light: dict[str, Said], bare: dict[str, Said]) -> None:
-    assert bare[name][:3] == light[name][:3]
-    assert light[name][0] in (0, None) and light[name][1].startswith(f"Usage: dmrl {name}")
+def test_help_needs_no_extra(
+    name: str,
+    results: dict[str, Result],
+    results_without_extras: dict[str, Result],
+) -> None:
+    status, output, errors, *_ = results[name]
+    assert results_without_extras[name][:3] == [status, output, errors]
+    assert status in (0, None) and output.startswith(f"Usage: dmrl {name}")
 
 
 @pytest.mark.heavy
-@pytest.mark.parametrize(
-    ("name", "words"),
-    [
-        ("train", ["dataset", "out"]),
-        ("view", ["a.mcap"]),
-    ],
-)
+@pytest.mark.parametrize(("name", "words"), [("train", ["dataset", "out"]), ("view", ["a.mcap"])])
 def test_without_the_extras_a_command_names_the_extra(
     name: str, words: list[str], tmp_path: Path
 ) -> None:
@@ -233,7 +232,7 @@ def test_unknown_command_suggests_the_nearest_with_or_without_extras() -> None:
     [["info"], ["info", "a.mcap", "--colour"], ["fly", "fly_in_view", "a.mcap", "--seed", "1.5"]],
 )
 def test_usage_error_is_on_stderr_with_status_2(arguments: list[str]) -> None:
-    done = dmrl(*arguments)
+    done = run_dmrl(*arguments)
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr.startswith("dmrl: ")
     assert "Traceback" not in done.stderr
@@ -241,7 +240,7 @@ def test_usage_error_is_on_stderr_with_status_2(arguments: list[str]) -> None:
 
 @pytest.mark.heavy
 def test_a_known_error_is_one_line_on_stderr_with_status_1(tmp_path: Path) -> None:
-    done = dmrl("info", str(tmp_path / "absent.mcap"))
+    done = run_dmrl("info", str(tmp_path / "absent.mcap"))
     assert (done.returncode, done.stdout) == (1, "")
     assert done.stderr.startswith("dmrl: ")
     assert "absent.mcap" in done.stderr
@@ -250,7 +249,9 @@ def test_a_known_error_is_one_line_on_stderr_with_status_1(tmp_path: Path) -> No
 
 @pytest.mark.heavy
 def test_flag_without_robot_name_shows_the_right_form(tmp_path: Path) -> None:
-    done = dmrl("label", str(tmp_path / "a.mcap"), str(tmp_path / "b.mcap"), "--camera", "my.toml")
+    done = run_dmrl(
+        "label", str(tmp_path / "a.mcap"), str(tmp_path / "b.mcap"), "--camera", "my.toml"
+    )
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr == (
         "dmrl: --camera my.toml does not say of what. Try: --camera.cf1 my.toml\n"
@@ -265,7 +266,9 @@ def test_overlong_error_keeps_its_file_and_remedy() -> None:
     assert truncate_middle("short") == "short"
 
 
-def _end_with(error: BaseException, monkeypatch: pytest.MonkeyPatch) -> object:
+def _raise_in_main(error: BaseException, monkeypatch: pytest.MonkeyPatch) -> object:
+    """Let a command of a plug-in raise an error; return the exit status of `main`."""
+
     def fail() -> None:
         raise error
 
@@ -280,26 +283,27 @@ def test_ctrl_c_ends_with_one_line_and_status_130(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(atomic_output, "_started_outputs", [])
-    assert _end_with(KeyboardInterrupt(), monkeypatch) == 130
+    assert _raise_in_main(KeyboardInterrupt(), monkeypatch) == 130
     assert capsys.readouterr().err.count("\n") == 1
 
 
 def test_ctrl_c_ends_a_command_that_waits_for_storage(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def standing() -> list[Path]:
+    def fail() -> list[Path]:
         raise StorageError("s3://lab/out: nobody answers")
 
-    monkeypatch.setattr(atomic_output, "list_finished_outputs", standing)
-    assert _end_with(KeyboardInterrupt(), monkeypatch) == 130
+    monkeypatch.setattr(atomic_output, "list_finished_outputs", fail)
+    assert _raise_in_main(KeyboardInterrupt(), monkeypatch) == 130
     said = "dmrl: stopped. What has its final name is not known: s3://lab/out: nobody answers\n"
     assert capsys.readouterr().err == said
 
 
-def _subclasses(error: type[Exception]) -> Iterator[type[Exception]]:
+def _iter_subclasses(error: type[Exception]) -> Iterator[type[Exception]]:
+    """Yield the subclasses of a class and theirs."""
     for child in error.__subclasses__():
         yield child
-        yield from _subclasses(child)
+        yield from _iter_subclasses(child)
 
 
 def test_documented_error_tree_equals_the_classes() -> None:
@@ -307,11 +311,12 @@ def test_documented_error_tree_equals_the_classes() -> None:
     drawn = [
         line.split()[1] for line in tree.splitlines() if line.lstrip()[:2] in ("* ", "- ", "+ ")
     ]
-    own = [e.__name__ for e in _subclasses(DmrlError) if e.__module__ == DmrlError.__module__]
+    own = [e.__name__ for e in _iter_subclasses(DmrlError) if e.__module__ == DmrlError.__module__]
     assert sorted(drawn) == sorted(["DmrlError", *own])
 
 
-def _prints(path: Path) -> Iterator[int]:
+def _find_message_prints(path: Path) -> Iterator[int]:
+    """Yield the lines of a module that call ``print(..., file=...)``."""
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         match node:
             case ast.Call(func=ast.Name("print"), keywords=words) if "file" in {
@@ -322,7 +327,7 @@ def _prints(path: Path) -> Iterator[int]:
 
 @pytest.mark.parametrize("path", sorted(STAGES.glob("*.py")), ids=lambda p: p.stem)
 def test_stages_print_data_only_and_leave_messages_to_progress(path: Path) -> None:
-    assert list(_prints(path)) == []
+    assert list(_find_message_prints(path)) == []
 
 
 @pytest.mark.heavy
@@ -336,10 +341,10 @@ def test_the_shell_completes_commands_flags_and_choices(tmp_path: Path) -> None:
         $(complete -p dmrl | sed 's/.*-F \\([^ ]*\\).*/\\1/')
         echo "${COMPREPLY[@]}" """
 
-    def completed(*words: str) -> list[str]:
+    def complete(*words: str) -> list[str]:
         line = ["bash", "-c", ask, "bash", str(script), *words]
         return subprocess.run(line, capture_output=True, text=True).stdout.split()
 
-    assert completed("dmrl", "pre") == ["predict"]
-    assert completed("dmrl", "predict", "--back") == ["--backend"]
-    assert {"onnx", "integer", "c"} <= set(completed("dmrl", "predict", "--backend", ""))
+    assert complete("dmrl", "pre") == ["predict"]
+    assert complete("dmrl", "predict", "--back") == ["--backend"]
+    assert {"onnx", "integer", "c"} <= set(complete("dmrl", "predict", "--backend", ""))

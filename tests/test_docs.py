@@ -24,8 +24,11 @@ HAND_WRITTEN = [page for page in PAGES if page.name != "commands.md"]
 RECIPES = sorted(ROOT.glob("recipes/**/*.toml"))
 
 
-def command_lines(page: Path) -> list[str]:
-    """``dmrl ...`` in the shell blocks of a page, or in a recipe up to two spaces."""
+def find_command_lines(page: Path) -> list[str]:
+    """Return the ``dmrl`` command lines in a page's shell blocks or a recipe's comments.
+
+    In a recipe, two spaces end the command.
+    """
     text = page.read_text(encoding="utf-8")
     if page.suffix == ".toml":
         return re.findall(r"^# (dmrl .*?)(?:  .*)?$", text, re.MULTILINE)
@@ -34,7 +37,7 @@ def command_lines(page: Path) -> list[str]:
     return re.findall(r"^(?:\$ )?(dmrl .*)", joined, re.MULTILINE)
 
 
-SHELL = [(p, line) for p in [*HAND_WRITTEN, *RECIPES] for line in command_lines(p)]
+SHELL = [(p, line) for p in [*HAND_WRITTEN, *RECIPES] for line in find_command_lines(p)]
 QUOTED = [
     (page, line)
     for page in HAND_WRITTEN
@@ -58,12 +61,12 @@ def test_every_command_and_flag_in_the_text_exists(page: Path, line: str) -> Non
 
 
 def test_the_readme_shows_commands() -> None:
-    assert len(command_lines(ROOT / "README.md")) >= 3
+    assert len(find_command_lines(ROOT / "README.md")) >= 3
 
 
 @pytest.fixture(scope="module")
 def generated() -> dict[Path, str]:
-    """The pages as `make docs` would write them."""
+    """Return the pages as `make docs` would write them."""
     return dict(runpy.run_path(str(ROOT / "docs/build.py"))["pages"]())
 
 
@@ -75,16 +78,16 @@ def test_generated_parts_are_fresh(page: str, generated: dict[Path, str]) -> Non
     assert (ROOT / page).read_text(encoding="utf-8") == generated[ROOT / page], "run: make docs"
 
 
-def links(page: Path) -> list[tuple[Path, str]]:
-    """Files of the repository that a page links to, and the heading in each, or ""."""
+def find_links(page: Path) -> list[tuple[Path, str]]:
+    """Return the files that a page links to, each with the anchor of a heading, or ""."""
     text = re.sub(r"```.*?```|`[^`\n]*`", "", page.read_text(encoding="utf-8"), flags=re.DOTALL)
     targets = re.findall(r"\]\(([^)\s]+)\)", text)
     inside = [t.partition("#") for t in targets if not re.match(r"[a-z]+:", t)]
     return [((page.parent / path).resolve() if path else page, at) for path, _, at in inside]
 
 
-def anchors(page: Path) -> set[str]:
-    """What GitHub calls the headings of a page."""
+def find_anchors(page: Path) -> set[str]:
+    """Return the anchors that GitHub gives to the headings of a page."""
     text = re.sub(r"```.*?```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL)
     headings = re.findall(r"^#+ (.*)", text, re.MULTILINE)
     return {re.sub(r"[^\w\- ]", "", h.strip().lower()).replace(" ", "-") for h in headings}
@@ -92,28 +95,28 @@ def anchors(page: Path) -> set[str]:
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)
 def test_every_link_leads_to_a_file_and_a_heading(page: Path) -> None:
-    found = links(page)
+    found = find_links(page)
     assert [path for path, _ in found if not path.exists()] == []
-    assert [(p.name, at) for p, at in found if at and at not in anchors(p)] == []
+    assert [(p.name, at) for p, at in found if at and at not in find_anchors(p)] == []
 
 
-def reached(start: Path) -> set[Path]:
-    """Pages that can be reached from one by links."""
+def find_reachable_pages(start: Path) -> set[Path]:
+    """Return the pages that can be reached from a page by links."""
     seen, todo = {start}, [start]
     while todo:
-        new = {p for p, _ in links(todo.pop()) if p.suffix == ".md" and p.exists()} - seen
+        new = {p for p, _ in find_links(todo.pop()) if p.suffix == ".md" and p.exists()} - seen
         seen |= new
         todo += new
     return seen
 
 
 def test_no_page_is_orphaned() -> None:
-    assert set(ROOT.glob("docs/*.md")) - reached(ROOT / "README.md") == set()
+    assert set(ROOT.glob("docs/*.md")) - find_reachable_pages(ROOT / "README.md") == set()
 
 
 def test_the_index_names_every_page() -> None:
     index = ROOT / "docs/index.md"
-    named = {path for path, _ in links(index)} | {index}
+    named = {path for path, _ in find_links(index)} | {index}
     assert sorted(p.name for p in set(ROOT.glob("docs/*.md")) - named) == []
 
 
@@ -128,8 +131,8 @@ def test_the_index_names_every_page() -> None:
     ],
 )
 def test_the_site_shows_titles_in_place_of_file_names(page: str, link: str, shown: str) -> None:
-    mend = runpy.run_path(str(ROOT / "docs/site.py"))["on_page_markdown"]
-    found = mend(
+    convert = runpy.run_path(str(ROOT / "docs/site.py"))["on_page_markdown"]
+    found = convert(
         f"See {link}\n```\n{link}\n```\n", SimpleNamespace(file=SimpleNamespace(src_uri=page))
     )
     assert found == f"See {shown}\n```\n{link}\n```\n"
@@ -157,7 +160,7 @@ def test_the_page_on_python_runs_as_it_stands(
 ) -> None:
     page = ROOT / "docs/python.md"
     monkeypatch.chdir(tmp_path)
-    for line in command_lines(page):
+    for line in find_command_lines(page):
         app(shlex.split(line)[1:], result_action="return_value")
     capsys.readouterr()
     code = re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
@@ -168,23 +171,23 @@ def test_the_page_on_python_runs_as_it_stands(
     assert "torch.Size([8, 3, 224, 320]) torch.Size([8, 28, 40])" in output
 
 
-STOP = re.compile(
+SKIPPED = re.compile(
     r"dmrl (view|render|dataset renders|train dataset (model$|few|refined)|train .*-renders)"
 )
-"""Needs a window, Blender, or long; a slow walk takes the last three."""
+"""Commands that need a window or Blender, or take long; slow tests run the last three kinds."""
 
 
-def blocks(page: Path, until: str | None) -> list[tuple[str, str]]:
-    """Shell, Python and TOML blocks of a page, in order; until a heading."""
+def find_blocks(page: Path, until: str | None) -> list[tuple[str, str]]:
+    """Return language and text of the code blocks of a page, in order, up to a heading."""
     text = page.read_text(encoding="utf-8")
     text = text if until is None else text[: text.index(until)]
     return re.findall(r"```(sh|python|toml)\n(.*?)```", text, re.DOTALL)
 
 
-def walk(page: Path, until: str | None = None, stop: re.Pattern[str] = STOP) -> None:
-    """Do what a page says, word for word, in the folder we are in."""
+def run_page(page: Path, until: str | None = None, skipped: re.Pattern[str] = SKIPPED) -> None:
+    """Run the commands and programs of a page in the working folder, as they are written."""
     names: dict[str, object] = {}
-    for kind, block in blocks(page, until):
+    for kind, block in find_blocks(page, until):
         if kind == "python":
             exec(block, names)
             continue
@@ -192,7 +195,7 @@ def walk(page: Path, until: str | None = None, stop: re.Pattern[str] = STOP) -> 
             Path("map.toml").write_text(block, encoding="utf-8")
             continue
         for line in re.findall(r"^(dmrl .*)", block.replace("\\\n", " "), re.MULTILINE):
-            if not stop.match(line):
+            if not skipped.match(line):
                 app(shlex.split(line, comments=True)[1:], result_action="return_value")
 
 
@@ -214,9 +217,9 @@ def test_commands_of_a_page_run_as_written(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    if name == "own_camera.md":  # the folder of pictures that the page says how to draw
+    if name == "own_camera.md":  # the page lets the reader draw these pictures
         app(["sketch", "shots", "--images", "12"], result_action="return_value")
-    walk(ROOT / "docs" / name, until)
+    run_page(ROOT / "docs" / name, until)
     assert said in capsys.readouterr().out
 
 
@@ -227,7 +230,7 @@ def test_own_camera_refinement_commands_run_as_written(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     app(["sketch", "shots", "--images", "40"], result_action="return_value")
-    walk(ROOT / "docs/own_camera.md", "## 4.", re.compile("dmrl view"))
+    run_page(ROOT / "docs/own_camera.md", "## 4.", re.compile("dmrl view"))
     assert capsys.readouterr().out.count("last loss") == 4
 
 
@@ -237,7 +240,7 @@ def test_readme_commands_run_as_written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    walk(ROOT / "README.md", stop=re.compile("dmrl view"))
+    run_page(ROOT / "README.md", skipped=re.compile("dmrl view"))
     assert {"tracks.mcap", "out"} <= {path.name for path in tmp_path.iterdir()}
     assert "mismatches" in capsys.readouterr().out
 
@@ -265,16 +268,19 @@ def test_faq_quotes_existing_error_messages() -> None:
     joined = re.sub(r'"\s*f?"', "", sources)
     parts = {part.strip() for heading in quoted for part in heading.split("...") if part.strip()}
     assert len(quoted) >= 8
-    assert [part for part in parts if part.replace("'", "'") not in joined] == []
+    assert [part for part in parts if part not in joined] == []
 
 
 def test_the_two_set_up_commands_are_targets_of_make() -> None:
-    wanted = set(re.findall(r"\bmake ([a-z-]+)", " ".join(_code(page) for page in HAND_WRITTEN)))
+    wanted = set(
+        re.findall(r"\bmake ([a-z-]+)", " ".join(_find_code(page) for page in HAND_WRITTEN))
+    )
     targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
     assert {"demo", "test"} <= wanted <= targets
 
 
-def _code(page: Path) -> str:
+def _find_code(page: Path) -> str:
+    """Return the shell blocks and the inline code of a page, joined by spaces."""
     text = page.read_text(encoding="utf-8")
     found = re.findall(r"```sh\n(.*?)```|`([^`\n]+)`", text, re.DOTALL)
     return " ".join(block or quoted for block, quoted in found)
@@ -283,9 +289,9 @@ def _code(page: Path) -> str:
 def test_make_demo_installs_the_documented_packages() -> None:
     makefile = (ROOT / "Makefile").read_text()
     (installed,) = re.findall(r"^\$\(VENV\)/\.demo:.*\n\t.*'\.\[(.*)\]'", makefile, re.MULTILINE)
-    typed = {line.split()[1] for line in command_lines(ROOT / "docs/first_evening.md")}
+    typed = {line.split()[1] for line in find_command_lines(ROOT / "docs/first_evening.md")}
     needed = {e for e, words in EXTRAS.items() if typed & set(re.findall(r"[a-z]+", words))}
-    optional = {"table", "deploy", "coco"}  # for --to csv, for ONNX where torch is, and for boxes
+    optional = {"table", "deploy", "coco"}  # for --to csv, ONNX beside PyTorch, and boxes
     assert {"label", "view"} <= needed <= set(installed.split(",")) | optional
 
 

@@ -1,4 +1,4 @@
-"""The examples run, in an empty folder, as their page says."""
+"""Scripts and notebooks of examples/ run in an empty folder."""
 
 import json
 import re
@@ -37,7 +37,7 @@ def test_a_script_runs_in_an_empty_folder(script: Path, tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("notebook", NOTEBOOKS, ids=lambda path: path.stem)
 def test_a_notebook_runs_in_an_empty_folder(notebook: Path, tmp_path: Path) -> None:
-    copy = shutil.copy(notebook, tmp_path)  # it runs where it lies
+    copy = shutil.copy(notebook, tmp_path)  # a notebook runs in its own folder
     command = [sys.executable, "-m", "nbconvert", "--to", "notebook", "--execute", "--inplace"]
     done = subprocess.run(
         [*command, copy], cwd=tmp_path, capture_output=True, text=True, check=False

@@ -1,4 +1,4 @@
-"""Examples in the help of commands: they parse and run."""
+"""The examples in the help of the commands parse and run."""
 
 import shlex
 import shutil
@@ -22,7 +22,7 @@ NEEDS = {
     "view seen.mcap": "a window",
     "calibrate": "pictures of a board, or flights that are long enough",
 }
-"""Commands whose examples are parsed, not run, with what they would need."""
+"""Commands whose examples are only parsed, and what running them would need."""
 RECIPE = """
 kind = "pipeline"
 
@@ -48,7 +48,8 @@ def test_an_example_can_be_typed_as_it_stands(line: str) -> None:
     app.parse_args(shlex.split(line)[1:], exit_on_error=False, print_error=False)
 
 
-def needs(line: str) -> str:
+def find_need(line: str) -> str:
+    """Return what a command line needs that the test lacks; empty if it can run."""
     return next((why for name, why in NEEDS.items() if line == f"dmrl {name}"), "") or next(
         (why for name, why in NEEDS.items() if line.split()[1] == name), ""
     )
@@ -63,7 +64,7 @@ def test_the_examples_run_one_after_the_other(
     Path("few.toml").write_text(RECIPE, encoding="utf-8")
     done = []
     for line in LINES:
-        if needs(line):
+        if find_need(line):
             continue
         if line.startswith("dmrl recover") and not Path("torn.mcap").exists():
             shutil.copy("flight.mcap", "torn.mcap")

@@ -1,4 +1,4 @@
-"""Late concurrent writers leave nothing and remove nothing."""
+"""A writer whose output appears before it takes the lock leaves and removes nothing."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -15,15 +15,15 @@ from dmrl.errors import OutputError
 def test_late_writer_leaves_no_partial_file(
     kind: str, keep: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Six times `dmrl train` or `render` into one name left a NAME.partial beside it."""
+    """Regression: several concurrent `dmrl train` or `render` with one name left NAME.partial."""
     out, take = tmp_path / "out", getattr(atomic_output, f"take_{kind}")
 
-    def taken_late(partial: Path) -> int:
-        out.touch()  # between the look at the name and the lock
+    def take_late(partial: Path) -> int:
+        out.touch()  # another writer finishes between the check of the name and the lock
         held: int = take(partial)
         return held
 
-    monkeypatch.setattr(atomic_output, f"take_{kind}", taken_late)
+    monkeypatch.setattr(atomic_output, f"take_{kind}", take_late)
     write: Callable[..., object] = atomic_file if kind == "file" else atomic_folder
     with pytest.raises(OutputError, match="exists"), write(out, keep_on_error=keep):  # type: ignore[attr-defined]
         raise AssertionError

@@ -1,11 +1,18 @@
-"""The mutation tool: which changes it makes."""
+"""Mutation testing: which changes are made, and which tests are run."""
 
 from pathlib import Path
 
 import pytest
 
 from . import mutations
-from .mutations import Mutant, drawn, files_of, mutants_of, named, near
+from .mutations import (
+    Mutant,
+    draw_mutants,
+    find_tests,
+    list_mutants,
+    list_test_files,
+    load_named_mutants,
+)
 
 SOURCE = '''"""Words of 1 + 1."""
 from pathlib import Path
@@ -23,16 +30,17 @@ def far(a: int, b: float = 0.5) -> bool:
 
 
 @pytest.fixture
-def found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[Mutant]:
+def mutants(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[Mutant]:
+    """Return every change of `SOURCE`, a module of a repository of one file."""
     monkeypatch.setattr(mutations, "REPOSITORY", tmp_path)
     (tmp_path / "dmrl" / "room").mkdir(parents=True)
     path = tmp_path / "dmrl" / "room" / "a.py"
     path.write_text(SOURCE)
-    return mutants_of(path)
+    return list_mutants(path)
 
 
-def test_every_mutation_is_applied_once_per_place(found: list[Mutant]) -> None:
-    assert sorted((m.line, m.kind, m.before, m.after) for m in found) == [
+def test_every_mutation_is_applied_once_per_place(mutants: list[Mutant]) -> None:
+    assert sorted((m.line, m.kind, m.before, m.after) for m in mutants) == [
         (4, "swap", "(wide, high)", "(high, wide)"),
         (6, "constant", "0.5", "1.0"),
         (8, "comparison", "a < 3", "(a <= 3)"),
@@ -52,29 +60,29 @@ def test_every_mutation_is_applied_once_per_place(found: list[Mutant]) -> None:
 
 
 def test_tests_of_a_mutant_are_its_module_s_then_those_naming_it() -> None:
-    def of(path: str) -> list[str]:
-        return near(Mutant(path, 1, "term", 0, 0, "", ""))
+    def find(path: str) -> list[str]:
+        return find_tests(Mutant(path, 1, "term", 0, 0, "", ""))
 
-    found = of("dmrl/recording/recover.py")
+    found = find("dmrl/recording/recover.py")
     assert found[0] == "tests/recording/test_recover.py"
     assert "tests/recording/test_flips.py" in found
     assert "tests/recording/test_provenance_inputs.py" not in found
-    assert len(of("dmrl/recording/nobody_names_this.py")) == len(files_of("recording"))
+    assert len(find("dmrl/recording/nobody_names_this.py")) == len(list_test_files("recording"))
 
 
-def test_every_change_can_be_compiled(found: list[Mutant]) -> None:
+def test_every_change_can_be_compiled(mutants: list[Mutant]) -> None:
     source = SOURCE.encode()
-    for mutant in found:
+    for mutant in mutants:
         assert source[mutant.start : mutant.end].decode() == mutant.before
         compile(source[: mutant.start] + mutant.after.encode() + source[mutant.end :], "a", "exec")
 
 
-def test_mutants_are_drawn_evenly_and_reproducibly(found: list[Mutant]) -> None:
-    first, again, other = (drawn("room", 6, seed, ()) for seed in (1, 1, 2))
+def test_mutants_are_drawn_evenly_and_reproducibly(mutants: list[Mutant]) -> None:
+    first, again, other = (draw_mutants("room", 6, seed, ()) for seed in (1, 1, 2))
     assert first == again != other
-    assert {m.kind for m in first} == {m.kind for m in found}
-    assert len(drawn("room", 99, 1, ())) == len(found)
-    assert drawn("room", 99, 1, ("a",)) == []
+    assert {m.kind for m in first} == {m.kind for m in mutants}
+    assert len(draw_mutants("room", 99, 1, ())) == len(mutants)
+    assert draw_mutants("room", 99, 1, ("a",)) == []
 
 
 LIST = """
@@ -89,21 +97,21 @@ tests = ["tests/other/test_c.py", "tests/test_d.py"]
 
 
 def test_named_mutants_are_found_and_missing_ones_reported(
-    found: list[Mutant], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    mutants: list[Mutant], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    assert found
+    assert mutants
     (tmp_path / "list.toml").write_text(LIST)
     monkeypatch.setattr(mutations, "NAMED", tmp_path / "list.toml")
-    ((change, tests),), gone = named()
+    ((change, tests),), gone = load_named_mutants()
     assert (change.line, change.kind, change.after) == (8, "off by one", "a < 4")
     assert SOURCE.encode()[change.start : change.end] == b"a < 3"
     assert tests == ("tests/room/test_a.py",)
     assert [line.split(":")[1].strip() for line in gone] == ["not there", "twice", "no file"]
-    assert named(("nobody",)) == ([], [])
+    assert load_named_mutants(("nobody",)) == ([], [])
 
 
 def test_the_list_of_changes_can_be_read() -> None:
-    changes, gone = named()
+    changes, gone = load_named_mutants()
     assert len(changes) > 5 * len(gone)
     for change, tests in changes:
         assert change.before != change.after
@@ -111,7 +119,7 @@ def test_the_list_of_changes_can_be_read() -> None:
 
 
 def test_every_named_mutant_applies() -> None:
-    """Code that was rewritten takes its protection's proof along, and nobody would see."""
-    found, gone = named()
+    """A named change whose text was rewritten no longer proves that a test protects the code."""
+    found, gone = load_named_mutants()
     assert not gone
     assert found

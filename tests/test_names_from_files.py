@@ -1,8 +1,8 @@
-"""Static checks: one module makes paths of names from files, one parses documents.
+"""Static checks: one module turns names from files into paths, and one parses documents.
 
-A path may be joined with a literal of the source. Any other name goes through a function of
-`dmrl.guards.safe_names`, or is listed below with the reason why it needs none. Untrusted documents
-are parsed in `dmrl.guards.bounded_parsing` alone, which has limits for them.
+A path may be joined with a literal. Any other name is checked by `dmrl.guards.safe_names`, or is
+listed below with the reason why it needs no check. Untrusted documents are parsed only in
+`dmrl.guards.bounded_parsing`, which limits their size and depth.
 """
 
 import ast
@@ -23,14 +23,14 @@ CHECKED = {
     "c_name",
     "shard_path",
 }
-"""Functions that give a name which can be that of a file, or a path that is made of one."""
+"""Functions that return a safe file name, or a path made of safe names."""
 METHODS = {"resolve", "absolute", "expanduser", "with_name", "with_suffix", "relative_to"}
 CHECKED_BEFORE = "checked just before"
-OURS = "made of our own words and numbers"
-LISTED = "the name of a file that was found there"
-GIVEN = "a path of the user's, with an ending of ours"
+OURS = "made of literals and numbers of dmrl"
+LISTED = "the name of an existing file in that folder"
+GIVEN = "a path given by the user, with a suffix of dmrl"
 BY_ROWS = "checked, or made of letters and digits, by ExportRows"
-READ = "only read: names of files beside each other"
+READ = "only read, in the folder of the source"
 REASONS = {
     "deploy/export_folder.py: decoded": OURS,
     "viewer/flag_page.py: name": OURS,
@@ -78,7 +78,7 @@ REASONS = {
     "formats/aideck/nanocockpit.py: folder": OURS,
     "learn/training/checkpoint.py: name": OURS,
     "learn/pretrained/__init__.py: model": LISTED,
-    "atomic_output.py: file": "what we wrote ourselves just now",
+    "atomic_output.py: file": "a file that dmrl has just written",
     "atomic_output.py: last": OURS,
     "atomic_output.py: path.name + PARTIAL_SUFFIX": GIVEN,
     "card/figures.py: name": OURS,
@@ -102,32 +102,32 @@ REASONS = {
     "stages/sketch.py: name": OURS,
     "storage/remote.py: *one.parts[len(self.parts):]": "a name in the same bucket",
     "storage/remote.py: hashlib.sha256(version.encode()).hexdigest()[:16]": OURS,
-    "storage/upload.py: file": "what we wrote ourselves just now",
+    "storage/upload.py: file": "a file that dmrl has just written",
 }
 PARSERS = ("json.load", "json.loads", "tomllib.load", "tomllib.loads", "np.load", "pickle.")
 MAY_PARSE = {
-    "deploy/export_folder.py": "what json.dumps has just made",
-    "deploy/usage.py": "what json.dumps has just made",
-    "terminal/help_pages.py": "a table of the package",
-    "rendering/robots/primitives.py": "a table of the package",
-    "rendering/robots/quadrotor.py": "a table of the package",
-    "rendering/backgrounds/room_items.py": "a table of the package",
-    "rendering/settings.py": "a table of the package",
-    "learn/inference/metric_definitions.py": "a table of the package",
-    "guards/bounded_parsing.py": "the home",
-    "rendering/blender/protocol.py": "what our own processes say to each other",
-    "pipeline/process_pool.py": "what our own processes say to each other",
-    "pipeline/job_worker.py": "what our own processes say to each other",
-    "learn/networks/hdf5_arrays.py": "what our own processes say to each other",
-    "recipe.py": "what json.dumps has just made",
-    "recording/provenance_inputs.py": "what json.dumps has just made",
-    "learn/training/checkpoint.py": "what json.dumps has just made",
+    "deploy/export_folder.py": "output of json.dumps",
+    "deploy/usage.py": "output of json.dumps",
+    "terminal/help_pages.py": "a file of the package",
+    "rendering/robots/primitives.py": "a file of the package",
+    "rendering/robots/quadrotor.py": "a file of the package",
+    "rendering/backgrounds/room_items.py": "a file of the package",
+    "rendering/settings.py": "a file of the package",
+    "learn/inference/metric_definitions.py": "a file of the package",
+    "guards/bounded_parsing.py": "the module for untrusted documents",
+    "rendering/blender/protocol.py": "messages between processes of dmrl",
+    "pipeline/process_pool.py": "messages between processes of dmrl",
+    "pipeline/job_worker.py": "messages between processes of dmrl",
+    "learn/networks/hdf5_arrays.py": "messages between processes of dmrl",
+    "recipe.py": "output of json.dumps",
+    "recording/provenance_inputs.py": "output of json.dumps",
+    "learn/training/checkpoint.py": "output of json.dumps",
 }
 
 
 @cache
 def sources() -> dict[str, list[ast.AST]]:
-    """Everything that stands in a module, by its name; parsed and walked through once."""
+    """Return the syntax nodes of every module, by the path of its file. Cached."""
     return {
         path.relative_to(SOURCE.parent).as_posix().removeprefix("dmrl/"): list(
             ast.walk(ast.parse(path.read_text(encoding="utf-8")))
@@ -137,13 +137,14 @@ def sources() -> dict[str, list[ast.AST]]:
 
 
 def _is_path_hint(hint: ast.expr | None) -> bool:
-    while isinstance(hint, ast.BinOp):  # Path | None
+    """Return whether an annotation is ``Path`` or ``Path | ...``."""
+    while isinstance(hint, ast.BinOp):
         hint = hint.left
     return isinstance(hint, ast.Name) and hint.id == "Path"
 
 
 class Paths:
-    """What of a module is a path, as far as its annotations tell."""
+    """Fields and functions that hold or return a path, according to their annotations."""
 
     def __init__(self, everywhere: dict[str, list[ast.AST]]) -> None:
         self.fields, self.functions = {"parent"}, {"Path"}
@@ -160,9 +161,9 @@ class Paths:
                 elif isinstance(node, ast.FunctionDef) and _is_path_hint(node.returns):
                     self.functions.add(node.name)
 
-    def joined(self, nodes: list[ast.AST]) -> Iterator[ast.expr]:
-        """Everything that a path of a module is joined with."""
-        names = self._names(nodes)
+    def iter_joined(self, nodes: list[ast.AST]) -> Iterator[ast.expr]:
+        """Yield every expression of a module that is joined to a path."""
+        names = self._find_path_variables(nodes)
         for node in nodes:
             if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Div):
                 if self._is_path(node.left, names):
@@ -173,14 +174,15 @@ class Paths:
             elif isinstance(node, ast.Call) and getattr(node.func, "id", "") == "Path":
                 yield from node.args[1:]
 
-    def _names(self, nodes: list[ast.AST]) -> set[str]:
+    def _find_path_variables(self, nodes: list[ast.AST]) -> set[str]:
+        """Return the names of arguments and variables of a module that hold a path."""
         found = {
             node.arg
             for node in nodes
             if isinstance(node, ast.arg) and _is_path_hint(node.annotation)
         }
         named = [node for node in nodes if isinstance(node, ast.Assign | ast.withitem)]
-        for _ in range(3):  # names that are made of names
+        for _ in range(3):  # for variables that are assigned from variables
             for node in named:
                 if isinstance(node, ast.Assign) and self._is_path(node.value, found):
                     found |= {t.id for t in node.targets if isinstance(t, ast.Name)}
@@ -192,6 +194,7 @@ class Paths:
         return found
 
     def _is_path(self, node: ast.expr, names: set[str]) -> bool:
+        """Return whether an expression is a path; ``names`` are the variables that hold one."""
         match node:
             case ast.Name(id=name):
                 return name in names
@@ -210,8 +213,8 @@ class Paths:
         return False
 
 
-def _is_ours(node: ast.expr) -> bool:
-    """Whether a text stands in the source, or has been checked."""
+def _is_trusted(node: ast.expr) -> bool:
+    """Return whether a string is made of literals, constants and checked names only."""
     match node:
         case ast.Constant():
             return True
@@ -219,33 +222,35 @@ def _is_ours(node: ast.expr) -> bool:
             return name.isupper()
         case ast.JoinedStr(values=values):
             return all(
-                _is_ours(v.value) if isinstance(v, ast.FormattedValue) else True for v in values
+                _is_trusted(v.value) if isinstance(v, ast.FormattedValue) else True for v in values
             )
         case ast.BinOp(left=left, op=ast.Add(), right=right):
-            return _is_ours(left) and _is_ours(right)
+            return _is_trusted(left) and _is_trusted(right)
         case ast.Call(func=ast.Name(id=name)) | ast.Call(func=ast.Attribute(attr=name)):
             return name in CHECKED
         case ast.IfExp(body=body, orelse=other):
-            return _is_ours(body) and _is_ours(other)
+            return _is_trusted(body) and _is_trusted(other)
     return False
 
 
-def joins() -> set[str]:
-    """Every place where a path is joined with what may come from a file: file and text."""
+def find_untrusted_joins() -> set[str]:
+    """Return ``file: expression`` for every expression joined to a path that is not trusted."""
     paths = Paths(sources())
     return {
         f"{name}: {ast.unparse(part)}"
         for name, nodes in sources().items()
-        for part in paths.joined(nodes)
-        if not _is_ours(part)
+        for part in paths.iter_joined(nodes)
+        if not _is_trusted(part)
     }
 
 
 @pytest.mark.heavy
 def test_a_path_is_joined_with_checked_names_alone() -> None:
-    found = joins()
-    assert found - REASONS.keys() == set(), "use dmrl.guards.safe_names, or add the reason"
-    assert REASONS.keys() - found == set(), "these are no more"
+    found = find_untrusted_joins()
+    assert found - REASONS.keys() == set(), (
+        "use dmrl.guards.safe_names, or add the reason to REASONS"
+    )
+    assert REASONS.keys() - found == set(), "REASONS lists expressions that no longer exist"
 
 
 @pytest.mark.heavy

@@ -60,7 +60,7 @@ def test_the_provenance_names_every_stage_before() -> None:
 
 @pytest.mark.heavy
 @pytest.mark.parametrize("path", [FLIGHT, RENDERS], ids=lambda path: path.stem)
-def test_commands_that_read_take_them(path: Path, tmp_path: Path) -> None:
+def test_old_recordings_can_be_listed_checked_and_viewed(path: Path, tmp_path: Path) -> None:
     assert json.loads(run_dmrl("info", path, "--json"))
     run_dmrl("check", path)
     run_dmrl("view", path, "--save", tmp_path / "view.rrd")

@@ -21,7 +21,7 @@ MAPPED = [package for package, folder in FOLDER_OF.items() if package.replace(".
 
 
 def folder_of(package: str) -> str:
-    """Folder of a package in the checkout."""
+    """Return the folder of a package in the checkout."""
     return FOLDER_OF.get(package, package.replace(".", "/"))
 
 
@@ -52,7 +52,7 @@ def test_every_extra_is_in_the_extra_that_brings_all() -> None:
 def test_constraints_pin_every_direct_dependency_within_its_bounds() -> None:
     packaging = pytest.importorskip("packaging.requirements")
     pinned = {
-        _name(line.split("==")[0]): line.split("==")[1].split()[0]
+        _normalize_name(line.split("==")[0]): line.split("==")[1].split()[0]
         for line in (ROOT / "constraints.txt").read_text(encoding="utf-8").splitlines()
         if "==" in line
     }
@@ -65,11 +65,11 @@ def test_constraints_pin_every_direct_dependency_within_its_bounds() -> None:
     for text in listed:
         wanted = packaging.Requirement(text)
         if wanted.name != "dmrl":
-            assert wanted.specifier.contains(pinned[_name(wanted.name)]), text
+            assert wanted.specifier.contains(pinned[_normalize_name(wanted.name)]), text
 
 
 def test_every_pin_has_the_hashes_of_its_files() -> None:
-    """So `pip install --require-hashes -r constraints.txt` works."""
+    """`pip install --require-hashes -r constraints.txt` needs a hash for every file."""
     text = (ROOT / "constraints.txt").read_text(encoding="utf-8").replace("\\\n", " ")
     pins = [line for line in text.splitlines() if line and not line.startswith("#")]
     assert len(pins) > 200
@@ -77,13 +77,14 @@ def test_every_pin_has_the_hashes_of_its_files() -> None:
     assert [pin for pin in pins if "==" not in pin] == []
 
 
-def _name(package: str) -> str:
+def _normalize_name(package: str) -> str:
+    """Return the name of a distribution in the normal form of PEP 503."""
     return re.sub(r"[-_.]+", "-", package).lower()
 
 
 @pytest.fixture(scope="module")
 def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Folder with the wheel and the sdist, built from a copy of what git tracks."""
+    """Build the wheel and the sdist from a copy of the tracked files; return their folder."""
     source = tmp_path_factory.mktemp("source")
     out = tmp_path_factory.mktemp("dist")
     tracked = subprocess.run(
@@ -110,6 +111,7 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def wheel(built: Path) -> zipfile.ZipFile:
+    """Return the opened wheel."""
     return zipfile.ZipFile(next(built.glob("*.whl")))
 
 
@@ -139,7 +141,7 @@ def test_a_wheel_holds_the_licence(wheel: zipfile.ZipFile) -> None:
 
 
 @pytest.mark.heavy
-def test_an_sdist_can_be_built_from(built: Path) -> None:
+def test_sdist_holds_the_files_of_a_build(built: Path) -> None:
     with tarfile.open(next(built.glob("*.tar.gz"))) as archive:
         names = {name.partition("/")[2] for name in archive.getnames()}
     wanted = {"pyproject.toml", "README.md", "LICENSE", "dmrl/py.typed", "schemas/dmrl.binpb"}
@@ -152,7 +154,7 @@ def test_an_sdist_can_be_built_from(built: Path) -> None:
 
 @pytest.mark.slow
 def test_the_constraints_install_with_their_hashes_alone(tmp_path: Path) -> None:
-    """In an empty environment: every package is listed, and every file has its hash."""
+    """The constraints list every dependency, and the hash of every file that pip may choose."""
     subprocess.run([sys.executable, "-m", "venv", str(tmp_path / "venv")], check=True)
     words = ["install", "--dry-run", "--quiet", "--require-hashes", "-r", "constraints.txt"]
     pip = [str(tmp_path / "venv" / "bin" / "python"), "-m", "pip"]

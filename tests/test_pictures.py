@@ -1,4 +1,4 @@
-"""Images of README.md and docs/ are those of the present code."""
+"""Images of README.md and docs/ were drawn by the current code."""
 
 import re
 import runpy

@@ -1,4 +1,4 @@
-"""Names of `dmrl.plugins`: documented, at their places, and light."""
+"""The names of `dmrl.plugins` are documented, defined where it says, and cheap to import."""
 
 import re
 import subprocess

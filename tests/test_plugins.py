@@ -1,4 +1,4 @@
-"""Plug-ins by entry points: they work, load lazily, and fail safely."""
+"""Plug-ins installed as entry points work, load lazily, and fail safely."""
 
 import json
 import os
@@ -86,13 +86,13 @@ STAGE = """
 
 @pytest.fixture
 def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Install]:
-    """Install a package of one module, ``MODULE.py``, with its entry points."""
+    """Return a function that installs a package of one module with entry points."""
     site = tmp_path / "site"
     site.mkdir()
     monkeypatch.syspath_prepend(site)
     monkeypatch.setenv("PYTHONPATH", str(site), prepend=os.pathsep)
 
-    def installed(package: str, text: str, **entries: str) -> None:
+    def install_package(package: str, text: str, **entries: str) -> None:
         module = package.replace("-", "_")
         (site / f"{module}.py").write_text(textwrap.dedent(text))
         about = site / f"{module}-1.0.dist-info"
@@ -105,13 +105,14 @@ def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Install
         )
         entry_points.find_plugins.cache_clear()
 
-    yield installed
+    yield install_package
     entry_points.find_plugins.cache_clear()
     for path in site.glob("*.py"):
         sys.modules.pop(path.stem, None)
 
 
-def dmrl(*arguments: str, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
+def run_dmrl(*arguments: str, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
+    """Run the command in a process of its own."""
     command = [sys.executable, "-m", "dmrl.cli", *arguments]
     return subprocess.run(command, capture_output=True, text=True, check=False, cwd=cwd)
 
@@ -179,7 +180,7 @@ def test_a_format_that_fails_while_it_reads_leaves_nothing(
     install("alt-logs", FORMAT, formats="altitudes = alt_logs:FORMAT")
     source, out = tmp_path / "flight.alt", tmp_path / "out.mcap"
     source.write_text("1000 0.5\n2000 high\n")
-    done = dmrl("convert", str(source), str(out))
+    done = run_dmrl("convert", str(source), str(out))
     assert done.returncode == 1
     assert done.stderr.count("\n") == 1
     assert "of the package alt-logs, fails to read" in done.stderr
@@ -223,11 +224,11 @@ def test_a_broken_network_is_one_line_and_others_are_built(
 @pytest.mark.parametrize("entry", ["say-it = stages_of_mine", "say-it = stages_of_mine:command"])
 def test_a_stage_of_another_package_is_a_command(entry: str, install: Install) -> None:
     install("stages-of-mine", STAGE, stages=entry)
-    done = dmrl("say-it", "word", "--times", "2")
+    done = run_dmrl("say-it", "word", "--times", "2")
     assert (done.returncode, done.stdout, done.stderr) == (0, "wordword\n", "")
-    assert "How often." in dmrl("say-it", "--help").stdout
-    assert dmrl("say-it", "end").returncode == 7
-    failed = dmrl("say-it", "fall")
+    assert "How often." in run_dmrl("say-it", "--help").stdout
+    assert run_dmrl("say-it", "end").returncode == 7
+    failed = run_dmrl("say-it", "fall")
     assert failed.returncode == 1
     assert "of the package stages-of-mine, failed: ValueError: over the edge" in failed.stderr
     assert failed.stderr.count("\n") == 1
@@ -270,16 +271,16 @@ DECLARED = """
 def test_a_stage_of_another_package_is_built_from_its_run(install: Install, tmp_path: Path) -> None:
     install("stages-of-mine", DECLARED, stages="say-it = stages_of_mine")
     out = tmp_path / "out.txt"
-    done = dmrl("say-it", "a.mcap", str(out), "--times", "2", "--json")
+    done = run_dmrl("say-it", "a.mcap", str(out), "--times", "2", "--json")
     assert json.loads(done.stdout) == {"recording": str(out), "names": 2}
     assert out.read_text() == "a.mcapa.mcap"
-    helped = dmrl("say-it", "--help").stdout
+    helped = run_dmrl("say-it", "--help").stdout
     assert "What to copy." in helped and "--workers" in helped
 
 
 @pytest.fixture
-def smooth(install: Install, tmp_path: Path) -> Path:
-    """The command of docs/extend.md, and a folder with a recording of heights."""
+def heights(install: Install, tmp_path: Path) -> Path:
+    """Install the command `smooth` of docs/extend.md; return a folder with one recording."""
     page = EXTEND.read_text(encoding="utf-8")
     install("smooth", page.split("```python\n")[1].split("```")[0], stages="smooth = smooth")
     (tmp_path / "in").mkdir()
@@ -289,25 +290,25 @@ def smooth(install: Install, tmp_path: Path) -> Path:
 
 
 @pytest.mark.heavy
-def test_documented_command_runs_over_a_folder_and_resumes(smooth: Path, tmp_path: Path) -> None:
-    assert "was there" not in dmrl("smooth", "in", "out", "--window", "2", cwd=tmp_path).stdout
+def test_documented_command_runs_over_a_folder_and_resumes(heights: Path, tmp_path: Path) -> None:
+    assert "was there" not in run_dmrl("smooth", "in", "out", "--window", "2", cwd=tmp_path).stdout
     table = read_table(tmp_path / "out" / "a.mcap", "/cf1/height")
     assert table["height_m"].to_pylist() == [1.0, 2.0, 5.5]
     assert table["log_time"].to_pylist() == [5 * 10**9, 6 * 10**9, 7 * 10**9]
-    assert "was there" in dmrl("smooth", "in", "out", "--window", "2", cwd=tmp_path).stdout
-    done = dmrl("smooth", "in", "out", "--window", "3", cwd=tmp_path)
+    assert "was there" in run_dmrl("smooth", "in", "out", "--window", "2", cwd=tmp_path).stdout
+    done = run_dmrl("smooth", "in", "out", "--window", "3", cwd=tmp_path)
     assert done.returncode == 1 and "names other inputs or settings" in done.stderr
-    helped = dmrl("smooth", "--help").stdout
+    helped = run_dmrl("smooth", "--help").stdout
     assert "Smooth the heights of a recording." in helped and "Made by others" not in helped
-    assert "Made by others" in dmrl("--help").stdout
+    assert "Made by others" in run_dmrl("--help").stdout
 
 
 @pytest.mark.heavy
-def test_settings_of_a_command_are_keys_of_a_step(smooth: Path, tmp_path: Path) -> None:
+def test_settings_of_a_command_are_keys_of_a_step(heights: Path, tmp_path: Path) -> None:
     recipe = tmp_path / "recipe.toml"
     step = '[[step]]\nstage = "smooth"\nout = "b.mcap"\nrecording = "{data}/a.mcap"\n'
     recipe.write_text(f'kind = "pipeline"\n{step}window = 2\n')
-    done = dmrl("run", str(recipe), "--data", "in", "--out", "made", cwd=tmp_path)
+    done = run_dmrl("run", str(recipe), "--data", "in", "--out", "made", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     table = read_table(tmp_path / "made" / "b.mcap", "/cf1/height")
     assert table["height_m"].to_pylist() == [1.0, 2.0, 5.5]
@@ -325,17 +326,17 @@ def test_arguments_that_a_folder_form_would_lose_are_refused() -> None:
 @pytest.mark.heavy
 def test_a_broken_stage_is_listed_and_is_one_line_when_called(install: Install) -> None:
     install("stages-of-mine", "import nothing_like_it", stages="say-it = stages_of_mine")
-    helped = dmrl("--help")
+    helped = run_dmrl("--help")
     assert helped.returncode == 0
     assert "say-it" in helped.stdout
     assert "stages-of-mine" in helped.stdout
     assert helped.stderr == ""
     for words in (["say-it", "x"], ["say-it", "--help"]):
-        done = dmrl(*words)
+        done = run_dmrl(*words)
         assert done.returncode == 1
         assert "of the package stages-of-mine, cannot be loaded: ModuleNotFoundError" in done.stderr
         assert done.stderr.count("\n") == 1
-    assert dmrl("info", "--help").returncode == 0
+    assert run_dmrl("info", "--help").returncode == 0
 
 
 @pytest.mark.heavy

@@ -1,4 +1,4 @@
-"""Recipes: every fault is named before anything runs."""
+"""Recipes: every error is reported before anything runs."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ RECIPES = Path(__file__).parents[1] / "recipes"
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """Settings of a stage for these tests."""
+    """Settings of an imaginary stage."""
 
     images: int = 10
     rate_hz: float = 1.0
@@ -34,22 +34,22 @@ class Settings:
 
 
 @dataclass(frozen=True, slots=True)
-class Needy:
-    """A stage with a setting that has no default."""
+class RequiredSettings:
+    """Settings of an imaginary stage, one of which has no default."""
 
     robot: str
 
 
 @pytest.fixture
 def write(tmp_path: Path) -> Write:
-    """Writes a recipe and gives its path."""
+    """Return a function that writes a recipe and returns its path."""
 
-    def writer(text: str) -> Path:
+    def write_recipe(text: str) -> Path:
         path = tmp_path / "mine.toml"
         path.write_text(text, encoding="utf-8")
         return path
 
-    return writer
+    return write_recipe
 
 
 def test_settings_come_from_the_file_and_the_rest_from_the_defaults(write: Write) -> None:
@@ -60,8 +60,8 @@ def test_settings_come_from_the_file_and_the_rest_from_the_defaults(write: Write
     assert recipe.load(path, "draw", Settings) == Settings(3, 2.0, "hand", Path("a/b"), (64, 48))
 
 
-def keys_of(error: RecipeError) -> list[str]:
-    """Keys that a one-line error names."""
+def find_keys(error: RecipeError) -> list[str]:
+    """Return the keys that a one-line error names."""
     faults = str(error).split(" wrong key", 1)[1].split(": ", 1)[1]
     return [fault.split(":")[0] for fault in faults.split("; ")]
 
@@ -71,7 +71,7 @@ def test_every_wrong_key_is_named(write: Write) -> None:
     with pytest.raises(RecipeError) as caught:
         recipe.load(path, "draw", Settings)
     assert str(caught.value).startswith(f"{path} has 3 wrong keys: ")
-    assert sorted(keys_of(caught.value)) == ["imagse", "label", "rate_hz"]
+    assert sorted(find_keys(caught.value)) == ["imagse", "label", "rate_hz"]
 
 
 @pytest.mark.parametrize(
@@ -91,12 +91,12 @@ def test_values_are_not_coerced(write: Write, line: str, key: str | None) -> Non
     if key is None:
         assert "is not TOML" in str(caught.value)
     else:
-        assert keys_of(caught.value)[0].startswith(key)
+        assert find_keys(caught.value)[0].startswith(key)
 
 
 def test_a_setting_without_a_default_must_be_given(write: Write) -> None:
     with pytest.raises(RecipeError, match=r"has 1 wrong key: robot: field required\. Fix it$"):
-        recipe.load(write('kind = "fly"\n'), "fly", Needy)
+        recipe.load(write('kind = "fly"\n'), "fly", RequiredSettings)
 
 
 def test_recipe_of_another_kind_names_the_expected_kind(write: Write) -> None:
@@ -201,7 +201,7 @@ def test_depth_and_length_of_a_recipe_have_a_budget(
         recipe.read(write(text))
 
 
-def test_a_setting_may_be_called_as_a_method_of_pydantic(write: Write) -> None:
+def test_a_setting_may_have_the_name_of_a_pydantic_method(write: Write) -> None:
     @dataclass(frozen=True)
     class Copied:
         copy: bool = True
@@ -211,14 +211,15 @@ def test_a_setting_may_be_called_as_a_method_of_pydantic(write: Write) -> None:
 
 
 def test_unknown_key_suggests_the_nearest() -> None:
-    (fault,) = recipe.find_faults({"gat_m": 0.3}, _label_settings())
+    (fault,) = recipe.find_faults({"gat_m": 0.3}, _load_label_settings())
     assert fault == "gat_m: extra inputs are not permitted (did you mean gate_m?)"
 
 
-def test_a_path_in_a_bucket_stays_one() -> None:
-    made = recipe.check("x", {"sensors": "s3://lab/sensors.toml"}, _label_settings())
+def test_bucket_paths_are_kept() -> None:
+    made = recipe.check("x", {"sensors": "s3://lab/sensors.toml"}, _load_label_settings())
     assert str(made.sensors) == "s3://lab/sensors.toml"
 
 
-def _label_settings() -> Any:
+def _load_label_settings() -> Any:
+    """Return the settings class of `dmrl label`."""
     return import_module("dmrl.stages.label").Settings

@@ -12,6 +12,7 @@ ROW = re.compile(
 
 
 def require_test(file: str, name: str) -> None:
+    """Assert that a file of tests defines a test."""
     text = (TESTS / file).read_text(encoding="utf-8")
     assert re.search(rf"^def {name}\(", text, re.MULTILINE), f"{file}::{name}"
 
@@ -30,7 +31,7 @@ def test_every_claim_of_security_md_has_a_test() -> None:
 def test_tests_and_mutants_of_reliability_md_exist() -> None:
     _, _, table = PAGE.read_text(encoding="utf-8").partition("## Which test holds what")
     rows = ROW.findall(table)
-    assert len(rows) == table.count("\n| ") - 1 > 30  # all but the head
+    assert len(rows) == table.count("\n| ") - 1 > 30  # every row but the header
     changes = tomllib.loads((TESTS / "mutants.toml").read_text(encoding="utf-8"))
     known = {name for of in changes.values() for name in of}
     for file, name, change in rows:

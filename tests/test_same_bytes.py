@@ -45,7 +45,7 @@ if platform.machine() == "x86_64":
 
 
 def run(words: str, folder: Path, **settings: str) -> str:
-    """Run a command in a folder; return the hash of what it wrote."""
+    """Run a command in a folder; return the hash of its files, without SVG figures."""
     umask = int(settings.pop("UMASK", "022"), 8)
     subprocess.run(
         [sys.executable, "-m", "dmrl.cli", *words.split()],
@@ -63,6 +63,7 @@ def run(words: str, folder: Path, **settings: str) -> str:
 
 @pytest.fixture(scope="module")
 def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Fly 12 s with the default number of threads; return the recording."""
     folder = tmp_path_factory.mktemp("flight")
     run("fly fly_in_view flight.mcap --duration-s 12 --camera --camera-rate-hz 1", folder)
     return folder / "flight.mcap"
@@ -83,7 +84,7 @@ def test_same_seed_gives_same_bytes_on_any_machine(
 
 @pytest.mark.skipif((os.cpu_count() or 1) < 2, reason="one core has one thread")
 def test_stages_in_python_use_one_blas_thread(tmp_path: Path) -> None:
-    """NumPy was imported before, with as many threads as there are cores."""
+    """A stage limits BLAS to one thread even if NumPy was imported before with more."""
     code = """
 import sys
 import numpy

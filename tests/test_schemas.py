@@ -12,7 +12,7 @@ from dmrl.messages import find_descriptor, message_class, serialize_schema
 SCHEMAS = Path(__file__).parents[1] / "schemas"
 PROTOS = sorted(SCHEMAS.glob("dmrl/v1/*.proto"))
 
-# Names that other programs read: they stay.
+# Fields that other programs read. They must not be renamed or removed.
 CONTRACT = {
     "PeerPosition": "x y z covariance status",
     "PeerLabels": "peers",
@@ -61,7 +61,7 @@ def test_every_message_has_a_comment(path: Path) -> None:
 
 @pytest.mark.parametrize("path", PROTOS, ids=lambda p: p.stem)
 def test_every_field_has_a_unit_suffix_or_comment(path: Path) -> None:
-    """A comment holds for the block of fields below it, up to an empty line."""
+    """A comment applies to all fields below it up to an empty line."""
     unexplained, explained = [], False
     for line in path.read_text(encoding="utf-8").splitlines():
         text = line.strip()
@@ -71,7 +71,7 @@ def test_every_field_has_a_unit_suffix_or_comment(path: Path) -> None:
             explained = True
         elif found := re.match(r"(?:repeated )?[\w.]+ (\w+) = \d+;", text):
             unit = re.search(r"_(px|m|s|ns|rad|mps|radps)$", found[1])
-            # A list of messages is explained where the message is.
+            # A field that holds a message is explained by the comment of that message.
             nested = re.match(r"(repeated )?[A-Z]", text)
             if not (explained or unit or nested):
                 unexplained.append(found[1])
@@ -84,7 +84,7 @@ def test_a_file_is_named_after_its_last_message(path: Path) -> None:
     assert re.sub(r"(?<!^)(?=[A-Z])", "_", names[-1]).lower() == path.stem
 
 
-def test_short_names_mean_dmrl_first_and_foxglove_then() -> None:
+def test_short_names_are_looked_up_in_dmrl_then_in_foxglove() -> None:
     assert find_descriptor("PeerLabels").full_name == "dmrl.v1.PeerLabels"
     assert find_descriptor("CompressedImage").full_name == "foxglove.CompressedImage"
     assert message_class("Height")(height_m=0.5).height_m == 0.5

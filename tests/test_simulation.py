@@ -1,4 +1,4 @@
-"""dmrl.simulation from Python: reset, step, images on request."""
+"""Reset, step and render of `dmrl.simulation`."""
 
 import importlib.util
 import subprocess
@@ -35,7 +35,8 @@ def test_reset_starts_the_same_flight_again() -> None:
     while not simulation.is_over:
         simulation.step({"cf1": (0.5, 0.0, 0.0, 0.0)})
     assert simulation.time_s == pytest.approx(1.0)
-    assert simulation.step({})["cf1"].time_s == pytest.approx(1.0)  # nothing beyond the end
+    # A step beyond the end has no effect.
+    assert simulation.step({})["cf1"].time_s == pytest.approx(1.0)
     again = simulation.reset(3)["cf1"]
     assert again.time_s == 0.0 and again.height_m == start.height_m
 
@@ -49,7 +50,7 @@ def test_an_image_shows_the_peers_that_are_in_front() -> None:
     assert picture.rgb.shape == (224, 320, 3)
     assert picture.depth_m[0] == pytest.approx(x, abs=0.05) == pytest.approx(0.8, abs=0.05)
     assert picture.visible_share[0] > 0.5
-    # Half a turn later it is behind.
+    # Turn until the peer is behind the robot.
     while abs(np.arctan2(*simulation.peer_position("cf1", "cf2")[1::-1])) < 2.5:
         simulation.step({"cf1": (0.0, 0.0, 0.0, 1.5)})
     assert len(simulation.render("cf1").depth_m) == 0
@@ -83,16 +84,16 @@ def test_wrong_commands_are_named() -> None:
         Simulation(robots=30).reset(0)
 
 
-def test_the_package_is_light_until_a_flight_starts() -> None:
+def test_import_of_the_simulation_loads_neither_numpy_nor_torch() -> None:
     code = "import sys, dmrl.simulation; print(sorted({'numpy', 'torch'} & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
 
 
 @pytest.mark.heavy
-def test_the_environment_of_the_examples_is_one_of_gymnasium() -> None:
+def test_example_environment_passes_the_gymnasium_check() -> None:
     pytest.importorskip("gymnasium")
-    from gymnasium.utils.env_checker import check_env  # noqa: PLC0415 - not everybody has it
+    from gymnasium.utils.env_checker import check_env  # noqa: PLC0415 - optional
 
     path = Path(__file__).parents[1] / "examples" / "follow_env.py"
     assert len(path.read_text().splitlines()) < 80

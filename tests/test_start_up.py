@@ -1,4 +1,4 @@
-"""Commands load no heavy package that they do not need: a table of commands and packages."""
+"""Commands load no heavy package that they do not need."""
 
 import os
 import subprocess
@@ -26,20 +26,23 @@ TABLE = {
         "h5py",
     },
 }
-"""Packages of `HEAVY` that a command may load."""
+"""Packages of `HEAVY` that each command may load."""
 LISTED = f"print(*(m for m in {sorted(HEAVY)} if m in sys.modules), file=open('loaded', 'w'))"
 CODE = f"import sys\nfrom dmrl.cli import main\ntry:\n    main()\nfinally:\n    {LISTED}"
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder with a simulated flight, and an ONNX model in its cache."""
     folder = tmp_path_factory.mktemp("start")
-    dmrl("fly fly_in_view flight.mcap --duration-s 12 --seed 5 --camera --camera-rate-hz 1", folder)
-    dmrl("predict dmrl-nano flight.mcap first.mcap --backend onnx", folder)  # makes the ONNX once
+    run_dmrl(
+        "fly fly_in_view flight.mcap --duration-s 12 --seed 5 --camera --camera-rate-hz 1", folder
+    )
+    run_dmrl("predict dmrl-nano flight.mcap first.mcap --backend onnx", folder)  # caches the model
     return folder
 
 
-def dmrl(line: str, folder: Path) -> set[str]:
+def run_dmrl(line: str, folder: Path) -> set[str]:
     """Run a command; return the heavy packages that it has loaded."""
     environment = {**os.environ, "XDG_CACHE_HOME": str(folder / "cache"), "OMP_NUM_THREADS": "1"}
     command = [sys.executable, "-P", "-c", CODE, *line.split()]
@@ -51,4 +54,4 @@ def dmrl(line: str, folder: Path) -> set[str]:
 @pytest.mark.heavy
 @pytest.mark.parametrize("line", TABLE)
 def test_a_command_loads_only_the_packages_of_its_row(line: str, folder: Path) -> None:
-    assert dmrl(line, folder) <= TABLE[line]
+    assert run_dmrl(line, folder) <= TABLE[line]

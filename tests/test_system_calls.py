@@ -1,7 +1,7 @@
-"""Every command, its system calls traced: no socket, no file outside OUT, nothing left behind.
+"""Commands open no network socket, write only to OUT, and leave no temporary file.
 
-SECURITY.md names what is allowed beside OUT. Sockets of `record`, `fake-drone`, `view --serve` and
-`--on ray` are named there too, and have tests of their own.
+Each command runs under strace. SECURITY.md lists the few other paths that a command may write, and
+the commands that need sockets: `record`, `fake-drone`, `view --serve` and `--on ray`.
 """
 
 import os
@@ -17,7 +17,7 @@ from dmrl.cli import COMMANDS
 from dmrl.rendering.blender_environment import environment_folder
 
 from .faults.inputs import Inputs
-from .test_telemetry import users_environment
+from .test_telemetry import make_user_environment
 
 pytestmark = [
     pytest.mark.slow,
@@ -59,7 +59,7 @@ ROWS = {
     "run": "run {chain} --out {out}/a",
 }
 ELSEWHERE = {
-    "demo": "runs the commands above, one after the other",
+    "demo": "runs the commands above in turn",
     "record": "listens to robots: tests/faults/test_processes.py",
     "fake-drone": "sends to them: tests/faults/test_processes.py",
     "score": "reads what `dmrl run benchmark` wrote",
@@ -73,18 +73,19 @@ DEVICES = ("/dev/", "/proc/")
 
 @pytest.fixture(scope="module")
 def inputs(tmp_path_factory: pytest.TempPathFactory) -> Inputs:
+    """Return the input files of the commands, each made on first use."""
     return Inputs(tmp_path_factory.mktemp("inputs"))
 
 
-def fill(words: str, inputs: Inputs, out: Path) -> list[str]:
-    """Return the words of a row, with its inputs made."""
+def fill_in_paths(words: str, inputs: Inputs, out: Path) -> list[str]:
+    """Return the words of a command line with the paths of its inputs and its output."""
     names = re.findall(r"{(\w+)}", words)
     places = {name: out if name == "out" else getattr(inputs, name) for name in names}
     return [word.format(**places) for word in words.split()]
 
 
-def written(line: str, cwd: Path) -> Path | None:
-    """Return the path that a traced call writes, creates or renames."""
+def find_written_path(line: str, cwd: Path) -> Path | None:
+    """Return the path that a traced call writes, creates or renames; None for other calls."""
     found = CALL.search(line)
     if not found or " = -1 " in line:
         return None
@@ -111,8 +112,8 @@ def test_a_command_opens_no_socket_and_writes_nowhere_else(
         shutil.copytree(inputs.flights, out / "flights")
     if row == "card":
         shutil.copytree(inputs.set, out / "set")
-    words, trace = fill(ROWS[row], inputs, out), tmp_path / "trace"
-    environment = users_environment(home) | {
+    words, trace = fill_in_paths(ROWS[row], inputs, out), tmp_path / "trace"
+    environment = make_user_environment(home) | {
         "TMPDIR": str(temporary),
         "PYTHONDONTWRITEBYTECODE": "1",
         "OMP_NUM_THREADS": "1",
@@ -138,7 +139,7 @@ def test_a_command_opens_no_socket_and_writes_nowhere_else(
     assert sockets == []
     own = [OWN_CACHE[row]] if row in OWN_CACHE else []
     allowed = (out, temporary, *(home / name for name in (*ALLOWED_HOME, *own)))
-    paths = {path for line in lines if (path := written(line, out))}
+    paths = {path for line in lines if (path := find_written_path(line, out))}
     elsewhere = [
         path
         for path in paths

@@ -1,4 +1,4 @@
-"""No dependency reports on its users, and none leaves an identifier behind."""
+"""No dependency sends usage data or stores an identifier of the user."""
 
 import os
 import subprocess
@@ -10,11 +10,11 @@ import pytest
 from dmrl.guards.telemetry import OPT_OUT
 
 CI = ("CI", "TF_BUILD", "GITHUB_ACTIONS", "JENKINS_URL", "BUILD_ID")
-"""Variables that tell onnxruntime that nobody is to be counted."""
+"""Variables by which onnxruntime recognises a build server, where it sends no usage data."""
 
 
-def users_environment(home: Path) -> dict[str, str]:
-    """Return the environment of a user who has switched nothing off."""
+def make_user_environment(home: Path) -> dict[str, str]:
+    """Return the environment of a user who has not opted out of any usage data."""
     dropped = {*OPT_OUT, *CI}
     kept = {name: value for name, value in os.environ.items() if name not in dropped}
     places = ("HOME", "TMPDIR", "XDG_CACHE_HOME", "XDG_CONFIG_HOME")
@@ -44,6 +44,6 @@ def test_onnxruntime_leaves_no_identifier(tmp_path: Path) -> None:
         "detector = open_detector(resolve_model_path(Path('dmrl-nano')), 'onnx')\n"
         "detector.grids([np.zeros((224, 320, 3), np.uint8)])\n"
     )
-    subprocess.run([sys.executable, "-c", code], env=users_environment(home), check=True)
+    subprocess.run([sys.executable, "-c", code], env=make_user_environment(home), check=True)
     kept = [p.relative_to(home).as_posix() for p in home.rglob("*") if p.is_file()]
     assert [name for name in kept if not name.startswith((".cache/dmrl/onnx/", "dmrl/onnx/"))] == []

@@ -1,4 +1,4 @@
-"""The table of topics."""
+"""The table of topics: its rows, patterns and messages."""
 
 import pytest
 
@@ -10,7 +10,7 @@ from dmrl.topics import TOPICS, find_topic, list_robots, parse_topic
 
 @pytest.mark.parametrize("row", TOPICS, ids=lambda row: row.pattern)
 def test_every_row_names_a_message_that_exists(row: topics.Topic) -> None:
-    if row.message == "dmrl.log.*":  # made for each log
+    if row.message == "dmrl.log.*":  # a message type is made for each log
         name = message_class(LogType("state", (("a.b", "f"),))).DESCRIPTOR.full_name
         assert row.accepts_message(name) and not row.accepts_message("dmrl.v1.Height")
         return

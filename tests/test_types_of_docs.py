@@ -15,7 +15,7 @@ from packaging.requirements import Requirement
 
 ROOT = Path(__file__).parents[1]
 FRAGMENTS = {"rendering.md", "tracking.md"}
-"""Pages whose code names a camera or an image that it does not make."""
+"""Pages whose code uses variables that it does not define."""
 INCOMPLETE = {
     "formats.md": "datasets",
     "own_camera.md": "cv2",
@@ -27,8 +27,8 @@ INCOMPLETE = {
 PYRIGHT = shutil.which("pyright", path=str(Path(sys.executable).parent)) or shutil.which("pyright")
 
 
-def programs() -> dict[str, str]:
-    """The code of each page and example, by name."""
+def read_programs() -> dict[str, str]:
+    """Return the Python code of each page and example, by file name."""
     found = {path.name: path.read_text(encoding="utf-8") for path in ROOT.glob("examples/*.py")}
     for page in (ROOT / "README.md", *ROOT.glob("docs/*.md")):
         blocks = re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
@@ -38,7 +38,7 @@ def programs() -> dict[str, str]:
 
 
 def run_pyright(folder: Path) -> list[tuple[str, str]]:
-    """File and message of each error."""
+    """Run pyright in strict mode in a folder; return file and message of each error."""
     setup = {"typeCheckingMode": "strict", "reportMissingTypeStubs": False}
     (folder / "pyrightconfig.json").write_text(json.dumps(setup), encoding="utf-8")
     line = [str(PYRIGHT), "--pythonpath", sys.executable, "--outputjson", "."]
@@ -54,8 +54,8 @@ def run_pyright(folder: Path) -> list[tuple[str, str]]:
     ]
 
 
-def imported(code: str) -> set[str]:
-    """Top-level names of the packages that code imports."""
+def find_imports(code: str) -> set[str]:
+    """Return the top-level packages that code imports, without the standard library."""
     found: set[str] = set()
     for node in ast.walk(ast.parse(code)):
         if isinstance(node, ast.Import):
@@ -76,7 +76,7 @@ def test_make_demo_installs_what_pages_and_examples_import() -> None:
     listed += [text for extra in line[1].split(",") for text in extras[extra]]
     installed = {Requirement(text).name for text in listed} | {"dmrl"}
     packages = packages_distributions()
-    wanted = {name for code in programs().values() for name in imported(code)}
+    wanted = {name for code in read_programs().values() for name in find_imports(code)}
     assert {"gymnasium", "rosbags", "datasets", "torch", "cv2"} <= wanted
     lacking = [name for name in wanted - {"dmrl"} if not installed & set(packages[name])]
     assert lacking == []
@@ -85,7 +85,7 @@ def test_make_demo_installs_what_pages_and_examples_import() -> None:
 @pytest.mark.heavy
 @pytest.mark.skipif(PYRIGHT is None, reason="pyright is not installed: pip install pyright")
 def test_pages_and_examples_have_no_fault_that_pyright_finds(tmp_path: Path) -> None:
-    for name, code in programs().items():
+    for name, code in read_programs().items():
         head = ""
         if name in INCOMPLETE:
             rules = ("MemberType", "VariableType", "ArgumentType")

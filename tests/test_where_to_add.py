@@ -1,6 +1,7 @@
-"""docs/architecture.md's "Where to add": each row, tried in a copy of the sources.
+"""The table "Where to add" of docs/architecture.md, each row followed in a copy of the sources.
 
-A test edits the copy as the row says, and counts the files that it touched: the table must say so.
+A test edits the copy as its row says. The number of edited files must equal that of the table.
+Each test is named after its row.
 """
 
 import json
@@ -11,15 +12,15 @@ from pathlib import Path
 import pytest
 
 from .clone import ROOT, Clone
-from .viewer.rrd import panels
+from .viewer.rrd import read_panel_names
 
 pytestmark = pytest.mark.heavy
 
 PAGE = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
 
 
-def promised(row: str) -> int:
-    """Files that a row of the table says are touched."""
+def read_file_count(row: str) -> int:
+    """Return the number of files that the table gives for a row."""
     table = PAGE.split("## Where to add")[1]
     (found,) = re.findall(rf"^\| {row} \|.*\| (\d+) \|$", table, re.MULTILINE)
     return int(found)
@@ -27,11 +28,12 @@ def promised(row: str) -> int:
 
 @pytest.fixture
 def clone(tmp_path: Path) -> Clone:
+    """Return a copy of the sources."""
     return Clone(tmp_path / "clone")
 
 
-def flight(folder: Path, columns: dict[str, float]) -> Path:
-    """A flight of one robot as CSV: three rows of all that must be there, and of more."""
+def write_flight(folder: Path, columns: dict[str, float]) -> Path:
+    """Write a CSV flight of one robot: three rows of the required columns and of these."""
     names = ["time_s", "roll_rad", "pitch_rad", "yaw_rate_radps", "vx_mps", "vy_mps", "height_m"]
     rows = [[*names, *columns], *([k / 10, *[0.0] * 6, *columns.values()] for k in range(3))]
     folder.mkdir()
@@ -85,16 +87,16 @@ def test_a_sensor(clone: Clone, tmp_path: Path) -> None:
         ("Sonar", "sonar_m"),
     ):
         clone.write(f"schemas/dmrl/v1/{name.lower()}.proto", own.format(name, field))
-    clone.after("dmrl/topics.py", "TOPICS = (\n", SENSORS)
-    # Three sensors here: their messages, and one file.
-    assert clone.touched() == 3 + promised("a sensor")
-    clone.python(str(clone.root / "schemas" / "build.py"))
+    clone.insert_after("dmrl/topics.py", "TOPICS = (\n", SENSORS)
+    # The table of topics is counted; each of the three sensors also adds a schema.
+    assert clone.count_edited_files() == 3 + read_file_count("a sensor")
+    clone.run_python(str(clone.root / "schemas" / "build.py"))
 
     values = {"pressure_pa": 101_325.0, "range_up_m": 1.5, "sonar_cf2_m": 2.5}
-    source = flight(tmp_path / "flight", values)
+    source = write_flight(tmp_path / "flight", values)
     out, again, short = (tmp_path / f"{name}.mcap" for name in ("out", "again", "short"))
     shown, alone = tmp_path / "shown.rrd", tmp_path / "alone.rrd"
-    converted, info, _, merged, *_ = clone.dmrl(
+    converted, info, _, merged, *_ = clone.run_dmrl(
         ["convert", source, out],
         ["info", out, "--json"],
         ["trim", out, short, "--topic", "/cf1/pressure"],
@@ -109,13 +111,13 @@ def test_a_sensor(clone: Clone, tmp_path: Path) -> None:
     assert held["/cf1/range_up"]["count"] == held["/cf1/sonar/cf2"]["count"] == 3
     assert "/cf1/range/up" not in held
     assert "both have /cf1/pressure" in merged
-    assert {"pressure, Pa", "height, m", "distance of cf2, m"} <= panels(shown)
-    assert "pressure, Pa" in panels(alone)  # without anything that dmrl had before
+    assert {"pressure, Pa", "height, m", "distance of cf2, m"} <= read_panel_names(shown)
+    assert "pressure, Pa" in read_panel_names(alone)  # in a recording of this sensor alone
     shutil.copytree(ROOT / "docs", clone.root / "docs")
     place = str(clone.root / "docs")
     code = f"import sys; sys.path.insert(0, {place!r}); import build; print(build.topics())"
     row = "| `/<robot>/sonar/<peer>` | `dmrl.v1.Sonar` | - | m | 10 Hz |"
-    assert row in clone.python("-c", code)
+    assert row in clone.run_python("-c", code)
 
 
 FORMAT = '''
@@ -146,10 +148,10 @@ FORMAT = '''
 
 def test_a_foreign_format(clone: Clone, tmp_path: Path) -> None:
     clone.write("dmrl/formats/altitudes.py", FORMAT)
-    assert clone.touched() == promised("a foreign format")
+    assert clone.count_edited_files() == read_file_count("a foreign format")
     source, out = tmp_path / "flight.alt", tmp_path / "out.mcap"
     source.write_text("1000 0.5\n2000 0.75\n")
-    (output,) = clone.dmrl(["convert", source, out])
+    (output,) = clone.run_dmrl(["convert", source, out])
     assert "/cf1/height" in output
 
 
@@ -172,12 +174,14 @@ class Tiny(Network):
 
 def test_a_network(clone: Clone, tmp_path: Path) -> None:
     name = "dmrl/learn/networks/architectures.py"
-    clone.after(name, "    widths: ClassVar[tuple[int, int, int]] = (24, 64, 96)\n", "\n" + NETWORK)
-    clone.after(name, "ARCHITECTURES: dict[str, type[Network]] = {\n", '    "tiny": Tiny,\n')
-    assert clone.touched() == promised("a network")
+    clone.insert_after(
+        name, "    widths: ClassVar[tuple[int, int, int]] = (24, 64, 96)\n", "\n" + NETWORK
+    )
+    clone.insert_after(name, "ARCHITECTURES: dict[str, type[Network]] = {\n", '    "tiny": Tiny,\n')
+    assert clone.count_edited_files() == read_file_count("a network")
     made, out = tmp_path / "tiny", tmp_path / "export"
     made.mkdir()
-    output = clone.python(
+    output = clone.run_python(
         "-c",
         "import sys\n"
         "from pathlib import Path\n"
@@ -201,12 +205,14 @@ def _certain(out: OutputChannels, wanted: Targets, settings: LossSettings) -> Te
 
 def test_a_loss(clone: Clone) -> None:
     name = "dmrl/learn/training/losses.py"
-    clone.after(name, "    classes: tuple[str, ...] = ()\n", "    certain_weight: float = 0.0\n")
-    clone.after(name, "return class_loss(logits, wanted.class_id, wanted.weight)\n", LOSS)
+    clone.insert_after(
+        name, "    classes: tuple[str, ...] = ()\n", "    certain_weight: float = 0.0\n"
+    )
+    clone.insert_after(name, "return class_loss(logits, wanted.class_id, wanted.weight)\n", LOSS)
     term = '    LossTerm("certain_loss", "certain_weight", ("confidence",), _certain),\n'
-    clone.after(name, "TERMS = (\n", term)
-    assert clone.touched() == promised("a loss")
-    output = clone.python(
+    clone.insert_after(name, "TERMS = (\n", term)
+    assert clone.count_edited_files() == read_file_count("a loss")
+    output = clone.run_python(
         "-c",
         "import torch\n"
         "from dmrl.learn.data.batches import Batch\n"
@@ -266,9 +272,9 @@ COMMAND = '''
 
 def test_a_command(clone: Clone) -> None:
     clone.write("dmrl/stages/hello.py", COMMAND)
-    clone.after("dmrl/cli.py", "GROUPS = {\n", '    "Greet": ("hello",),\n')
-    assert clone.touched() == promised("a command")
-    greeted, shouted, told, helped, listed = clone.dmrl(
+    clone.insert_after("dmrl/cli.py", "GROUPS = {\n", '    "Greet": ("hello",),\n')
+    assert clone.count_edited_files() == read_file_count("a command")
+    greeted, shouted, told, helped, listed = clone.run_dmrl(
         ["hello", "cf1"],
         ["hello", "cf1", "--loud"],
         ["hello", "cf1", "--json"],
@@ -310,14 +316,14 @@ VIEW = '''
 
 def test_a_view(clone: Clone, tmp_path: Path) -> None:
     clone.write("viewer/views/heights.py", VIEW)
-    assert clone.touched() == promised("a view")
+    assert clone.count_edited_files() == read_file_count("a view")
     out, shown = tmp_path / "out.mcap", tmp_path / "shown.rrd"
-    *_, explained = clone.dmrl(
-        ["convert", flight(tmp_path / "flight", {}), out],
+    *_, explained = clone.run_dmrl(
+        ["convert", write_flight(tmp_path / "flight", {}), out],
         ["view", out, "--layout", "heights", "--save", shown],
         ["view", "--help"],
     )
-    assert panels(shown) == {"heights alone, m"}
+    assert read_panel_names(shown) == {"heights alone, m"}
     assert "heights" in explained
 
 

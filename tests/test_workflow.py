@@ -1,4 +1,4 @@
-"""The workflow of the forge runs .ci/run, and keeps the files that it builds."""
+"""The GitHub workflow runs .ci/run and uploads the files that it builds."""
 
 import os
 import re

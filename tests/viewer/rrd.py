@@ -1,4 +1,4 @@
-"""Contents of an .rrd file."""
+"""Read the contents of an .rrd file."""
 
 from collections import Counter
 from operator import itemgetter
@@ -8,8 +8,8 @@ from typing import Any
 from rerun.chunk import RrdReader
 
 
-def logged(path: Path) -> dict[tuple[str, str], int]:
-    """Rows by entity and archetype; what is static counts as "static"."""
+def count_rows(path: Path) -> dict[tuple[str, str], int]:
+    """Return the number of rows by entity and archetype; static rows are counted apart."""
     rows: Counter[tuple[str, str]] = Counter()
     for chunk in RrdReader(path).stream():
         kinds = {n.partition(":")[0] for n in chunk.to_record_batch().schema.names if ":" in n}
@@ -20,8 +20,8 @@ def logged(path: Path) -> dict[tuple[str, str], int]:
     return dict(rows)
 
 
-def column(path: Path, entity: str, component: str) -> list[Any]:
-    """Values of a component, row by row."""
+def read_column(path: Path, entity: str, component: str) -> list[Any]:
+    """Return the values of a component, row by row."""
     values: list[Any] = []
     for chunk in RrdReader(path).stream():
         batch = chunk.to_record_batch()
@@ -30,8 +30,8 @@ def column(path: Path, entity: str, component: str) -> list[Any]:
     return values
 
 
-def columns(path: Path) -> dict[tuple[str, str], list[Any]]:
-    """Values of every component of every entity, by log time."""
+def read_columns(path: Path) -> dict[tuple[str, str], list[Any]]:
+    """Return log time and value of every row of every component, in the order of log time."""
     rows: dict[tuple[str, str], list[tuple[int, Any]]] = {}
     for chunk in RrdReader(path).stream():
         batch = chunk.to_record_batch()
@@ -45,8 +45,8 @@ def columns(path: Path) -> dict[tuple[str, str], list[Any]]:
     return {key: sorted(found, key=itemgetter(0)) for key, found in rows.items()}
 
 
-def panels(path: Path) -> set[str]:
-    """Names of the views of the layout."""
+def read_panel_names(path: Path) -> set[str]:
+    """Return the names of the views of the layout."""
     reader = RrdReader(path)
     names: set[str] = set()
     for chunk in reader.stream(store=reader.blueprints()[0]):
@@ -56,8 +56,8 @@ def panels(path: Path) -> set[str]:
     return names
 
 
-def queries(path: Path) -> list[list[str]]:
-    """What each view of the layout shows, line by line."""
+def read_queries(path: Path) -> list[list[str]]:
+    """Return the query of each view of the layout, line by line."""
     reader = RrdReader(path)
     found: list[list[str]] = []
     for chunk in reader.stream(store=reader.blueprints()[0]):

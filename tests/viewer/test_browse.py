@@ -1,4 +1,4 @@
-"""Logged data of the layout ``dataset``: rows, worst first."""
+"""Logged data of the layout ``dataset``, which sorts rows by their error."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -16,17 +16,17 @@ from dmrl.recording import build_provenance as made_by
 from dmrl.stages import dataset as dataset_stage
 from dmrl.viewer import Settings, save
 
-from .rrd import column, logged, panels
+from .rrd import count_rows, read_column, read_panel_names
 
 Make = Callable[..., Path]
 STEP_NS = 100_000_000
 OFF_PX = (3.0, 30.0, 1.0, 10.0)
-"""How far off the model is in each image with a peer; the last image shows nobody."""
+"""Errors of the detections in the four images with a peer, pixels."""
 
 
 @pytest.fixture(scope="module")
 def pictures(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Five labelled images; nobody is in the last."""
+    """Return five labelled images; the last shows no peer."""
     path = tmp_path_factory.mktemp("browse") / "pictures.mcap"
     with RecordingWriter(path, Provenance("test")) as sink:
         for k in range(5):
@@ -41,7 +41,7 @@ def pictures(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def folder(pictures: Path) -> Path:
-    """The five images as a dataset."""
+    """Return the five images as a dataset."""
     out = pictures.with_name("set")
     dataset_stage.run([pictures], out, dataset_stage.Settings(split="none"))
     return out
@@ -49,7 +49,7 @@ def folder(pictures: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def found(pictures: Path) -> Path:
-    """What a model found in them, each time that far off."""
+    """Return detections in the five images with the errors of `OFF_PX`."""
     path = pictures.with_name("found.mcap")
     with RecordingWriter(path, made_by("predict", Settings(), (pictures,))) as sink:
         for k, off_px in enumerate((*OFF_PX, 0.0)):
@@ -70,12 +70,13 @@ def found(pictures: Path) -> Path:
 
 @pytest.fixture
 def rrd(tmp_path: Path) -> Path:
+    """Return the path of an .rrd file to be written."""
     return tmp_path / "rows.rrd"
 
 
-def greys(path: Path) -> list[int]:
-    """Grey of the pictures, in the order they are shown: it tells which they are."""
-    return [bytes(pixels)[0] for (pixels,) in column(path, "/row/image", "Image:buffer")]
+def read_greys(path: Path) -> list[int]:
+    """Return the grey level of each image, which identifies it, in the order of display."""
+    return [bytes(pixels)[0] for (pixels,) in read_column(path, "/row/image", "Image:buffer")]
 
 
 @pytest.mark.heavy
@@ -83,38 +84,38 @@ def test_the_worst_row_comes_first_and_those_without_a_peer_last(
     folder: Path, found: Path, rrd: Path
 ) -> None:
     assert save([folder, found], rrd, Settings()) == 5
-    assert greys(rrd) == [40, 120, 0, 80, 160]
-    errors_px = column(rrd, "/row/error_px", "Scalars:scalars")
+    assert read_greys(rrd) == [40, 120, 0, 80, 160]
+    errors_px = read_column(rrd, "/row/error_px", "Scalars:scalars")
     assert errors_px == [[30.0], [10.0], [3.0], [1.0]]
-    facts = [words for (words,) in column(rrd, "/row/facts", "TextDocument:text")]
+    facts = [words for (words,) in read_column(rrd, "/row/facts", "TextDocument:text")]
     assert "**30.0 px** pixel error" in facts[0]
     assert "**0.50 m** depth error" in facts[0]
     assert "recording pictures.mcap" in facts[0]
     assert "No peer in view" in facts[4]
-    assert column(rrd, "/row/detections", "Points2D:positions")[0] == [[50.0, 12.0]]
-    maps = column(rrd, "/row/grid/confidence", "DepthImage:buffer")
+    assert read_column(rrd, "/row/detections", "Points2D:positions")[0] == [[50.0, 12.0]]
+    maps = read_column(rrd, "/row/grid/confidence", "DepthImage:buffer")
     assert np.frombuffer(bytes(maps[0][0]), "<f4")[0] == np.float32(0.1)
 
 
 @pytest.mark.heavy
 def test_a_dataset_alone_is_shown_in_its_order_with_its_own_maps(folder: Path, rrd: Path) -> None:
     assert save([folder], rrd, Settings()) == 5
-    assert greys(rrd) == [0, 40, 80, 120, 160]
-    assert "error by rank, px" not in panels(rrd)
+    assert read_greys(rrd) == [0, 40, 80, 120, 160]
+    assert "error by rank, px" not in read_panel_names(rrd)
     truth = open_dataset(folder).split("train").confidence
-    maps = column(rrd, "/row/grid/confidence", "DepthImage:buffer")
+    maps = read_column(rrd, "/row/grid/confidence", "DepthImage:buffer")
     assert bytes(maps[0][0]) == truth[0].astype("<f4").tobytes()
-    assert logged(rrd)["/row/labels/truth/points", "Points2D"] == 5
+    assert count_rows(rrd)["/row/labels/truth/points", "Points2D"] == 5
 
 
 @pytest.mark.heavy
 def test_rows_are_filtered_by_error_and_number(folder: Path, found: Path, rrd: Path) -> None:
     between = Settings(error_from_px=2.0, error_to_px=20.0)
     assert save([folder, found], rrd, between) == 2
-    assert greys(rrd) == [120, 0]
+    assert read_greys(rrd) == [120, 0]
     rrd.unlink()
     assert save([folder, found], rrd, Settings(most=1)) == 1
-    assert greys(rrd) == [40]
+    assert read_greys(rrd) == [40]
 
 
 def test_filter_without_matches_reports_the_error_range(
@@ -129,11 +130,13 @@ def test_filter_without_matches_reports_the_error_range(
     assert list(rrd.parent.glob("*.rrd*")) == []
 
 
-def test_a_recording_of_other_images_is_refused(folder: Path, make: Make, rrd: Path) -> None:
+def test_a_recording_of_other_images_is_refused(
+    folder: Path, make_recording: Make, rrd: Path
+) -> None:
     with pytest.raises(RecordingError, match=r"was not made from .*other\.mcap"):
-        save([folder, make("other.mcap")], rrd, Settings())
+        save([folder, make_recording("other.mcap")], rrd, Settings())
     with pytest.raises(RecordingError, match=r"has no detections. Try: dmrl predict"):
-        save([folder, make("blind.mcap", without=("detections",))], rrd, Settings())
+        save([folder, make_recording("blind.mcap", without=("detections",))], rrd, Settings())
 
 
 def test_invalid_dataset_or_layout_is_reported(tmp_path: Path, folder: Path, rrd: Path) -> None:

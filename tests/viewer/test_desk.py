@@ -19,7 +19,7 @@ pytestmark = [pytest.mark.heavy, pytest.mark.timeout(600)]
 
 @pytest.fixture(scope="module")
 def seen(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A recording with truth and a network's detections."""
+    """Return a folder with images, detections of a network, and a dataset."""
     place = tmp_path_factory.mktemp("desk")
     dmrl.sketch(place / "pictures", images=24, seed=4)
     dmrl.convert(place / "pictures", place / "flight.mcap")
@@ -28,13 +28,15 @@ def seen(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return place
 
 
-def screen_place(browser: Browser, u_px: float, v_px: float) -> tuple[float, float]:
+def find_screen_position(browser: Browser, u_px: float, v_px: float) -> tuple[float, float]:
+    """Return the position of an image pixel in the browser window, pixels."""
     script = f"""const at = new DOMPoint({u_px}, {v_px}).matrixTransform(
         document.querySelector('#stage svg').getScreenCTM()); return [at.x, at.y];"""
     return tuple(browser.run(script))
 
 
-def label(browser: Browser, row: int, k: int) -> dict[str, float]:
+def read_label(browser: Browser, row: int, k: int) -> dict[str, float]:
+    """Return label k of a row of the page."""
     return dict(browser.run(f"return rows[{row}].labels[{k}];"))
 
 
@@ -54,7 +56,7 @@ def test_edits_on_the_label_desk_reach_the_dataset(
         browser.open(page)
         assert browser.run("return document.documentElement.scrollWidth <= innerWidth;")
         assert browser.run("return shown.length;") == 24
-        # Marks have the colours of all other pictures, and a legend.
+        # Marks have the colours of the other views, and a legend.
         marks = "label: truth", "label: hand", "detection of 0.52 or more", "less sure"
         legend = browser.run("return byId('legend').textContent;")
         assert [part.strip() for part in legend.split("\u00a0") if part.strip()] == list(marks)
@@ -63,20 +65,21 @@ def test_edits_on_the_label_desk_reach_the_dataset(
                 f"return document.querySelector('#rows {mark}').getAttribute('stroke');"
             )
             assert colour == f"rgb{RGB[name]}"
-        # The page of a dataset is by error; rows are told by their time.
+        # A dataset is sorted by error, so rows are identified by their time.
         times = browser.run("return rows.map(row => row.time_ns);")
-        row = next(k for k, t in enumerate(times) if len(truth_of(truth, t)) >= 1)
-        # 1: drag a label.
+        row = next(k for k, t in enumerate(times) if len(find_truth(truth, t)) >= 1)
+        # 1. Drag a label.
         browser.click(f"#row-{row}")
         assert re.search(r", suspicion \d+ %[,.]", browser.run("return byId('facts').textContent;"))
-        first = label(browser, row, 0)
+        first = read_label(browser, row, 0)
         browser.drag(
-            screen_place(browser, first["u_px"], first["v_px"]), screen_place(browser, 200, 100)
+            find_screen_position(browser, first["u_px"], first["v_px"]),
+            find_screen_position(browser, 200, 100),
         )
-        moved = label(browser, row, 0)
+        moved = read_label(browser, row, 0)
         assert abs(moved["u_px"] - 200) < 1.5 and abs(moved["v_px"] - 100) < 1.5
         browser.screenshot(tmp_path / f"desk-{width_px}.png")
-        # 2: draw one in the next image, by the keys; 3: flag the one after.
+        # 2. Draw a label in the next image by the keyboard. 3. Flag the image after it.
         second, third = (
             browser.run(f"return shown[(shown.indexOf(rows[{row}]) + {k}) % 24].index;")
             for k in (1, 2)
@@ -87,7 +90,9 @@ def test_edits_on_the_label_desk_reach_the_dataset(
             if shown == second:
                 before = browser.run(f"return rows[{second}].labels.length;")
                 browser.press("n")
-                browser.drag(screen_place(browser, 40, 60), screen_place(browser, 40, 60))
+                browser.drag(
+                    find_screen_position(browser, 40, 60), find_screen_position(browser, 40, 60)
+                )
                 assert browser.run(f"return rows[{second}].labels.length;") == before + 1
             else:
                 browser.click('[data-key="f"]')
@@ -99,7 +104,7 @@ def test_edits_on_the_label_desk_reach_the_dataset(
     assert flags == ["source,robot,log_time", f'"{source}","cf1","{times[third]}"']
     found = dmrl.open(corrections)
     errors = [f.text for f in found.check() if f.level == "error"]
-    assert errors == ["labels without any image on /cf1/camera/image"]  # it holds no images
+    assert errors == ["labels without any image on /cf1/camera/image"]  # corrections have no images
     table = found["/cf1/labels"].to_arrow().to_pylist()
     assert sorted(one["log_time"] for one in table) == sorted(int(times[k]) for k in (row, second))
     assert {peer["source"] for one in table for peer in one["peers"]} == {"hand"}
@@ -135,7 +140,7 @@ def test_pictures_that_were_never_labelled_become_a_dataset_on_the_desk(
         browser.open(page)
         browser.click("#row-3")
         browser.press("n")
-        at = screen_place(browser, 40, 60)
+        at = find_screen_position(browser, 40, 60)
         browser.drag(at, at)
         facts = browser.run("return byId('facts').textContent;")
         assert "no depth" in facts and "suspicion" not in facts
@@ -144,7 +149,7 @@ def test_pictures_that_were_never_labelled_become_a_dataset_on_the_desk(
         assert "nobody in view" in browser.run("return byId('facts').textContent;")
         browser.press("j")
         browser.press("e")
-        browser.press("z")  # undone: not labelled again
+        browser.press("z")  # undo the last step
         unsaved = "return !dispatchEvent(new Event('beforeunload', {cancelable: true}));"
         assert browser.run(unsaved)
         browser.press("\ue00c")
@@ -161,7 +166,8 @@ def test_pictures_that_were_never_labelled_become_a_dataset_on_the_desk(
         dmrl.make_dataset(seen / "flight.mcap", tmp_path / "other", corrections=corrections)
 
 
-def truth_of(table: list[dict[str, object]], time_ns: str) -> list[object]:
+def find_truth(table: list[dict[str, object]], time_ns: str) -> list[object]:
+    """Return the labels of an image that are not near its edges."""
     (one,) = (row for row in table if row["log_time"] == int(time_ns))
     peers = one["peers"]
     assert isinstance(peers, list)

@@ -20,7 +20,7 @@ from .conftest import Make
 
 
 class _Tags(HTMLParser):
-    """Every tag, and every address."""
+    """Collects the tags and addresses of a page."""
 
     def __init__(self, html: str) -> None:
         super().__init__()
@@ -34,30 +34,34 @@ class _Tags(HTMLParser):
         self.places += [named[key] or "" for key in ("href", "src") if key in named]
 
 
-def rows_of(page: Path) -> list[dict[str, Any]]:
-    """The rows that a page holds."""
+def read_rows(page: Path) -> list[dict[str, Any]]:
+    """Return the rows that a page holds."""
     (text,) = re.findall(
         r'<script type="application/json" id="data">(.*?)</script>', page.read_text()
     )
     return list(json.loads(text)["rows"])
 
 
-def key(row: dict[str, Any]) -> list[Any]:
+def get_key(row: dict[str, Any]) -> list[Any]:
+    """Return source, robot and time of a row, as in flags.csv."""
     return [row["source"], row["robot"], int(row["time_ns"])]
 
 
 @pytest.fixture
-def built(make: Make, tmp_path: Path) -> Path:
+def dataset_folder(make_recording: Make, tmp_path: Path) -> Path:
+    """Return a dataset of ten images."""
     settings = dataset.Settings(split="none", labels="truth")
-    dataset.run([make()], tmp_path / "set", settings)
+    dataset.run([make_recording()], tmp_path / "set", settings)
     return tmp_path / "set"
 
 
 @pytest.mark.heavy
-def test_every_row_names_its_image_and_nothing_is_fetched(built: Path, tmp_path: Path) -> None:
-    command([built], flag_to=tmp_path / "flag.html")
-    rows = rows_of(tmp_path / "flag.html")
-    assert [key(row) for row in rows] == [
+def test_every_row_names_its_image_and_nothing_is_fetched(
+    dataset_folder: Path, tmp_path: Path
+) -> None:
+    command([dataset_folder], flag_to=tmp_path / "flag.html")
+    rows = read_rows(tmp_path / "flag.html")
+    assert [get_key(row) for row in rows] == [
         ["flight.mcap", "cf1", k * 100_000_000] for k in range(10)
     ]
     assert [len(row["labels"]) for row in rows] == [1] * 9 + [0]
@@ -66,9 +70,9 @@ def test_every_row_names_its_image_and_nothing_is_fetched(built: Path, tmp_path:
     assert _Tags(page).places == [] and "://" not in page.replace("http://www.w3.org", "")
 
 
-def test_a_recording_is_shown_with_its_own_detections(make: Make, tmp_path: Path) -> None:
-    command([make()], flag_to=tmp_path / "flag.html")
-    rows = rows_of(tmp_path / "flag.html")
+def test_a_recording_is_shown_with_its_own_detections(make_recording: Make, tmp_path: Path) -> None:
+    command([make_recording()], flag_to=tmp_path / "flag.html")
+    rows = read_rows(tmp_path / "flag.html")
     assert len(rows) == 10
     assert [len(row["found"]) for row in rows] == [2] * 10
     assert [len(row["labels"]) for row in rows] == [2] * 9 + [0]
@@ -76,10 +80,10 @@ def test_a_recording_is_shown_with_its_own_detections(make: Make, tmp_path: Path
 
 @pytest.mark.heavy
 def test_flagged_rows_are_omitted_and_recorded_in_provenance(
-    built: Path, make: Make, tmp_path: Path
+    dataset_folder: Path, make_recording: Make, tmp_path: Path
 ) -> None:
-    write_flag_page([built], tmp_path / "flag.html", Settings())
-    marked = [key(row) for row in rows_of(tmp_path / "flag.html")[2:4]]
+    write_flag_page([dataset_folder], tmp_path / "flag.html", Settings())
+    marked = [get_key(row) for row in read_rows(tmp_path / "flag.html")[2:4]]
     with (tmp_path / "flags.csv").open("w", newline="") as stream:
         csv.writer(stream).writerows([["source", "robot", "log_time"], *marked])
     settings = dataset.Settings(split="none", labels="truth", without=tmp_path / "flags.csv")
@@ -91,22 +95,22 @@ def test_flagged_rows_are_omitted_and_recorded_in_provenance(
 
 
 @pytest.mark.heavy
-def test_names_of_recordings_cannot_become_markup(make: Make, tmp_path: Path) -> None:
-    odd = make("a<img src=x onerror=alert(1)>.mcap")
+def test_names_of_recordings_cannot_become_markup(make_recording: Make, tmp_path: Path) -> None:
+    odd = make_recording("a<img src=x onerror=alert(1)>.mcap")
     dataset.run([odd], tmp_path / "set", dataset.Settings(split="none", labels="truth"))
     write_flag_page([tmp_path / "set"], tmp_path / "flag.html", Settings())
     assert "img" not in _Tags((tmp_path / "flag.html").read_text()).tags
 
 
-def test_a_page_is_called_html(make: Make, tmp_path: Path) -> None:
+def test_flag_page_needs_the_suffix_html(make_recording: Make, tmp_path: Path) -> None:
     with pytest.raises(SettingError, match=r"--flag \.html"):
-        command([make()], flag_to=tmp_path / "flag.csv")
+        command([make_recording()], flag_to=tmp_path / "flag.csv")
 
 
 @pytest.mark.parametrize("what", [["set", "flight.mcap"], ["flight.mcap"]])
 @pytest.mark.heavy
 def test_suspicion_knows_the_peaks_of_maps_that_predict_left_out(
-    what: list[str], built: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    what: list[str], dataset_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     known: list[Any] = []
 
@@ -121,5 +125,5 @@ def test_suspicion_knows_the_peaks_of_maps_that_predict_left_out(
         sure, weak, faint = found
         assert (sure["confidence"], weak["confidence"]) == (0.9, 0.1)
         assert faint == pytest.approx({"u_px": 36, "v_px": 36, "depth_m": 1.8, "confidence": 0.06})
-    shown = [one for row in rows_of(tmp_path / "flag.html") for one in row["found"]]
+    shown = [one for row in read_rows(tmp_path / "flag.html") for one in row["found"]]
     assert len(shown) == 20

@@ -20,34 +20,35 @@ from dmrl.stages import fly as fly_stage
 from dmrl.viewer import Settings, save, scene
 from dmrl.viewer.session import prepare_show
 
-from .rrd import column, columns, logged, panels
+from .rrd import count_rows, read_column, read_columns, read_panel_names
 
 pytestmark = pytest.mark.heavy
 
 Make = Callable[..., Path]
 POSITION, TRUTH = "/cf1/peer/cf2/position", "/cf1/peer/cf2/truth"
 STILL = ("/tf/cf1/horizontal", "Transform3D")
-"""A frame that never moves has one row."""
+"""A transform that never changes has one row."""
 
 
 @pytest.fixture
 def rrd(tmp_path: Path) -> Path:
+    """Return the path of an .rrd file to be written."""
     return tmp_path / "flight.rrd"
 
 
-def moving(path: Path) -> dict[tuple[str, str], int]:
-    """Rows of what has a time, without what lies in images."""
+def count_timed_rows(path: Path) -> dict[tuple[str, str], int]:
+    """Return the number of rows with a time, without those of labels and detections."""
     return {
         key: n
-        for key, n in logged(path).items()
+        for key, n in count_rows(path).items()
         if not key[1].startswith("static") and not key[0].startswith(("/cf1/lab", "/cf1/det"))
     }
 
 
-def test_every_message_of_a_flight_becomes_its_archetypes(fly: Make, rrd: Path) -> None:
-    assert save([fly()], rrd, Settings()) == 20
+def test_every_message_of_a_flight_becomes_its_archetypes(make_flight: Make, rrd: Path) -> None:
+    assert save([make_flight()], rrd, Settings()) == 20
     plots = ["distance", "error/x", "error/y", "bound/x", "bound/y", "nees", "nees/limit"]
-    assert moving(rrd) == {
+    assert count_timed_rows(rrd) == {
         STILL: 1,
         ("/tf/cf2/horizontal", "Transform3D"): 20,
         ("/tf/cf1/camera", "Transform3D"): 20,
@@ -75,7 +76,7 @@ def test_every_message_of_a_flight_becomes_its_archetypes(fly: Make, rrd: Path) 
             for n in ("roll", "pitch", "yaw")
         },
     }
-    still = {key for key in logged(rrd) if key[1].startswith("static")}
+    still = {key for key in count_rows(rrd) if key[1].startswith("static")}
     assert {
         ("/tf/cf1/optical", "static Transform3D"),
         ("/cf1/camera/calibration", "static Pinhole"),
@@ -84,9 +85,9 @@ def test_every_message_of_a_flight_becomes_its_archetypes(fly: Make, rrd: Path) 
     } <= still
 
 
-def test_the_panels_have_units(fly: Make, rrd: Path) -> None:
-    save([fly()], rrd, Settings())
-    assert panels(rrd) == {
+def test_the_panels_have_units(make_flight: Make, rrd: Path) -> None:
+    save([make_flight()], rrd, Settings())
+    assert read_panel_names(rrd) == {
         "space, world, grid 1 m",
         "cf1 image",
         "distance of cf2, m",
@@ -102,10 +103,10 @@ def test_the_panels_have_units(fly: Make, rrd: Path) -> None:
     }
 
 
-def test_errors_bounds_and_nees_are_right(fly: Make, rrd: Path) -> None:
-    save([fly()], rrd, Settings())
+def test_errors_bounds_and_nees_are_right(make_flight: Make, rrd: Path) -> None:
+    save([make_flight()], rrd, Settings())
     values = {
-        name: np.array(column(rrd, f"{POSITION}/{name}", "Scalars:scalars"))
+        name: np.array(read_column(rrd, f"{POSITION}/{name}", "Scalars:scalars"))
         for name in ("error/x", "bound/x", "bound/y", "nees", "distance")
     }
     assert values["error/x"] == pytest.approx(0.1)
@@ -115,11 +116,13 @@ def test_errors_bounds_and_nees_are_right(fly: Make, rrd: Path) -> None:
     assert values["distance"] == pytest.approx(1.1)
 
 
-def test_an_ellipsoid_has_two_sigmas_along_the_axes_of_the_covariance(fly: Make, rrd: Path) -> None:
-    save([fly()], rrd, Settings())
-    (half,) = column(rrd, f"{POSITION}/covariance", "Ellipsoids3D:half_sizes")[0]
+def test_an_ellipsoid_has_two_sigmas_along_the_axes_of_the_covariance(
+    make_flight: Make, rrd: Path
+) -> None:
+    save([make_flight()], rrd, Settings())
+    (half,) = read_column(rrd, f"{POSITION}/covariance", "Ellipsoids3D:half_sizes")[0]
     assert sorted(half) == pytest.approx([0.1, 0.2, 0.4])
-    (xyzw,) = column(rrd, f"{POSITION}/covariance", "Ellipsoids3D:quaternions")[0]
+    (xyzw,) = read_column(rrd, f"{POSITION}/covariance", "Ellipsoids3D:quaternions")[0]
     x, y, z, w = xyzw
     # The axis with the largest half size points along y.
     axes = np.array(
@@ -133,98 +136,104 @@ def test_an_ellipsoid_has_two_sigmas_along_the_axes_of_the_covariance(fly: Make,
     assert spread == pytest.approx(4 * np.diag([0.01, 0.04, 0.0025]), abs=1e-6)
 
 
-def test_trails_are_in_the_world_and_positions_in_the_robots_frame(fly: Make, rrd: Path) -> None:
-    save([fly()], rrd, Settings())
-    strips = column(rrd, f"{TRUTH}/trail", "LineStrips3D:strips")
-    # cf1 stands at (1, 2, 0.5) and looks along y: 1 m ahead of it is (1, 3, 0.5).
+def test_trails_are_in_the_world_and_positions_in_the_robots_frame(
+    make_flight: Make, rrd: Path
+) -> None:
+    save([make_flight()], rrd, Settings())
+    strips = read_column(rrd, f"{TRUTH}/trail", "LineStrips3D:strips")
+    # cf1 is at (1, 2, 0.5) and faces along y, so that 1 m ahead is (1, 3, 0.5).
     assert strips[5][0][1] == pytest.approx([1.0, 3.0, 0.5], abs=1e-6)
-    assert column(rrd, f"{TRUTH}/trail", "CoordinateFrame:frame") == [["world"]]
-    assert column(rrd, TRUTH, "CoordinateFrame:frame") == [["cf1/horizontal"]]
-    assert column(rrd, "/cf1/camera/image", "CoordinateFrame:frame") == [["cf1/image"]]
+    assert read_column(rrd, f"{TRUTH}/trail", "CoordinateFrame:frame") == [["world"]]
+    assert read_column(rrd, TRUTH, "CoordinateFrame:frame") == [["cf1/horizontal"]]
+    assert read_column(rrd, "/cf1/camera/image", "CoordinateFrame:frame") == [["cf1/image"]]
 
 
-def test_without_tf_everything_is_around_the_robot(fly: Make, rrd: Path) -> None:
-    save([fly(without=("/tf",))], rrd, Settings(robot="cf1"))
-    assert "space, cf1/horizontal, grid 1 m" in panels(rrd)
-    strips = column(rrd, f"{TRUTH}/trail", "LineStrips3D:strips")
+def test_without_tf_everything_is_around_the_robot(make_flight: Make, rrd: Path) -> None:
+    save([make_flight(without=("/tf",))], rrd, Settings(robot="cf1"))
+    assert "space, cf1/horizontal, grid 1 m" in read_panel_names(rrd)
+    strips = read_column(rrd, f"{TRUTH}/trail", "LineStrips3D:strips")
     assert strips[5][0][1] == pytest.approx([1.0, 0.0, 0.0])
-    assert column(rrd, f"{TRUTH}/trail", "CoordinateFrame:frame") == [["cf1/horizontal"]]
+    assert read_column(rrd, f"{TRUTH}/trail", "CoordinateFrame:frame") == [["cf1/horizontal"]]
 
 
-def test_frames_have_a_place_at_the_time_that_a_viewer_opens_at(fly: Make, rrd: Path) -> None:
-    save([fly(moving=True)], rrd, Settings())
-    found = columns(rrd)
+def test_frames_have_a_place_at_the_time_that_a_viewer_opens_at(
+    make_flight: Make, rrd: Path
+) -> None:
+    save([make_flight(moving=True)], rrd, Settings())
+    found = read_columns(rrd)
     opens_ns, _ = found["/cf1/camera/image", "EncodedImage:blob"][0]
     first_ns, pose = found["/tf/cf1/horizontal", "Transform3D:translation"][0]
     assert first_ns == opens_ns
     assert pose is not None
 
 
-def test_a_range_points_to_where_the_peer_is_thought_to_be(fly: Make, rrd: Path) -> None:
-    save([fly()], rrd, Settings())
-    ((start, end),) = column(rrd, "/cf1/range/cf2/line", "LineStrips3D:strips")[0]
+def test_a_range_points_to_where_the_peer_is_thought_to_be(make_flight: Make, rrd: Path) -> None:
+    save([make_flight()], rrd, Settings())
+    ((start, end),) = read_column(rrd, "/cf1/range/cf2/line", "LineStrips3D:strips")[0]
     assert (start, end) == ([0, 0, 0], pytest.approx([1.05, 0, 0]))
-    assert column(rrd, "/cf2/range/cf1/sphere", "Ellipsoids3D:half_sizes")[0] == [[1, 1, 1]]
+    assert read_column(rrd, "/cf2/range/cf1/sphere", "Ellipsoids3D:half_sizes")[0] == [[1, 1, 1]]
 
 
-def test_an_estimate_that_is_not_ok_has_the_colour_of_its_status(fly: Make, rrd: Path) -> None:
-    save([fly()], rrd, Settings())
-    colours = [rgba >> 8 for (rgba,) in column(rrd, POSITION, "Points3D:colors")]
+def test_an_estimate_that_is_not_ok_has_the_colour_of_its_status(
+    make_flight: Make, rrd: Path
+) -> None:
+    save([make_flight()], rrd, Settings())
+    colours = [rgba >> 8 for (rgba,) in read_column(rrd, POSITION, "Points3D:colors")]
     doubted = int.from_bytes(bytes(STATUS_RGB["UNCONVERGED"]))
     assert colours == [doubted] * 5 + [int.from_bytes(bytes(RGB["estimate"]))] * 15
-    states = column(rrd, f"{POSITION}/status", "StateChange:state")
+    states = read_column(rrd, f"{POSITION}/status", "StateChange:state")
     assert states == [["UNCONVERGED"]] * 5 + [["OK"]] * 15
 
 
-def test_a_track_disappears_when_it_ends(fly: Make, rrd: Path) -> None:
-    save([fly()], rrd, Settings())
-    assert column(rrd, "/cf1/tracks", "Points3D:labels") == [["cf2 3"]] * 15 + [[]] * 5
-    assert column(rrd, "/cf1/tracks/covariance", "Ellipsoids3D:half_sizes")[19] == []
+def test_a_track_disappears_when_it_ends(make_flight: Make, rrd: Path) -> None:
+    save([make_flight()], rrd, Settings())
+    assert read_column(rrd, "/cf1/tracks", "Points3D:labels") == [["cf2 3"]] * 15 + [[]] * 5
+    assert read_column(rrd, "/cf1/tracks/covariance", "Ellipsoids3D:half_sizes")[19] == []
 
 
 def test_yaw_goes_on_where_it_turns_over(
-    fly: Make, rrd: Path, monkeypatch: pytest.MonkeyPatch
+    make_flight: Make, rrd: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # From 3.1 rad on, 0.01 rad a message, over many stretches.
+    # The yaw starts at 3.1 rad, grows by 0.01 rad a message, and is read in many batches.
     monkeypatch.setattr(scene, "MIN_BATCH_ROWS", 1)
-    save([fly()], rrd, Settings())
-    yaw = np.array(column(rrd, "/cf1/attitude/yaw", "Scalars:scalars"))[:, 0]
+    save([make_flight()], rrd, Settings())
+    yaw = np.array(read_column(rrd, "/cf1/attitude/yaw", "Scalars:scalars"))[:, 0]
     assert yaw == pytest.approx(np.degrees(3.1 + 0.01 * np.arange(20)))
-    roll = column(rrd, "/cf1/attitude/roll", "Scalars:scalars")
+    roll = read_column(rrd, "/cf1/attitude/roll", "Scalars:scalars")
     assert roll[0][0] == pytest.approx(np.degrees(0.1))
 
 
-def test_a_flight_without_images_is_shown_all_the_same(fly: Make, rrd: Path) -> None:
-    assert save([fly(without=("camera", "labels", "detections"))], rrd, Settings()) == 0
-    assert "cf1 image" not in panels(rrd)
-    assert moving(rrd)[POSITION, "Points3D"] == 20
+def test_a_flight_without_images_is_shown_all_the_same(make_flight: Make, rrd: Path) -> None:
+    assert save([make_flight(without=("camera", "labels", "detections"))], rrd, Settings()) == 0
+    assert "cf1 image" not in read_panel_names(rrd)
+    assert count_timed_rows(rrd)[POSITION, "Points3D"] == 20
 
 
-def test_from_and_to_hold_for_plots_too(fly: Make, rrd: Path) -> None:
-    assert save([fly()], rrd, Settings(from_s=0.5, to_s=1.0)) == 5
-    assert moving(rrd)[STILL] == 1
-    assert {n for key, n in moving(rrd).items() if key != STILL} == {5}
+def test_from_and_to_hold_for_plots_too(make_flight: Make, rrd: Path) -> None:
+    assert save([make_flight()], rrd, Settings(from_s=0.5, to_s=1.0)) == 5
+    assert count_timed_rows(rrd)[STILL] == 1
+    assert {n for key, n in count_timed_rows(rrd).items() if key != STILL} == {5}
 
 
-def test_every_thins_images_and_leaves_plots_whole(fly: Make, rrd: Path) -> None:
-    assert save([fly()], rrd, Settings(every=4)) == 5
-    assert moving(rrd)["/cf1/camera/image", "EncodedImage"] == 5
-    assert moving(rrd)[f"{POSITION}/nees", "Scalars"] == 20
+def test_every_thins_images_and_leaves_plots_whole(make_flight: Make, rrd: Path) -> None:
+    assert save([make_flight()], rrd, Settings(every=4)) == 5
+    assert count_timed_rows(rrd)["/cf1/camera/image", "EncodedImage"] == 5
+    assert count_timed_rows(rrd)[f"{POSITION}/nees", "Scalars"] == 20
 
 
-def test_empty_time_span_is_refused(fly: Make, rrd: Path) -> None:
-    recording = fly(without=("camera", "labels", "detections"))
+def test_empty_time_span_is_refused(make_flight: Make, rrd: Path) -> None:
+    recording = make_flight(without=("camera", "labels", "detections"))
     with pytest.raises(SettingError, match=r"lasts from 0 to 1.900 s. Change --from-s or --to-s"):
         save([recording], rrd, Settings(from_s=1.0, to_s=1.0))
 
 
-def test_unknown_robot_error_lists_known_ones(fly: Make, rrd: Path) -> None:
+def test_unknown_robot_error_lists_known_ones(make_flight: Make, rrd: Path) -> None:
     with pytest.raises(SettingError, match=r"no robot cf9 in .*It has: cf1, cf2"):
-        save([fly()], rrd, Settings(robot="cf9"))
+        save([make_flight()], rrd, Settings(robot="cf9"))
 
 
 def test_images_come_first_and_wait_for_no_more_of_the_flight(
-    fly: Make, monkeypatch: pytest.MonkeyPatch
+    make_flight: Make, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(chunk_builder, "CHUNK_BYTES", 1)
     monkeypatch.setattr(batch_reader, "JOINED_BYTES", 1)
@@ -236,7 +245,7 @@ def test_images_come_first_and_wait_for_no_more_of_the_flight(
         "decompress",
         lambda chunk, at: opened.append(at) or unpacked(chunk, at),
     )
-    show = prepare_show([fly()], Settings())
+    show = prepare_show([make_flight()], Settings())
     paths, before = [], None
     for times, entity in show.logged():
         if times is not None:
@@ -248,22 +257,22 @@ def test_images_come_first_and_wait_for_no_more_of_the_flight(
 
 
 def test_trails_errors_and_ranges_are_independent_of_batch_boundaries(
-    fly: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    make_flight: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def saved(name: str) -> dict[tuple[str, str], list[Any]]:
+    def save_and_read(name: str) -> dict[tuple[str, str], list[Any]]:
         path = tmp_path / f"{name}.rrd"
-        save([fly(f"{name}.mcap", moving=True)], path, Settings())
+        save([make_flight(f"{name}.mcap", moving=True)], path, Settings())
         return {
             key: values
-            for key, values in columns(path).items()
+            for key, values in read_columns(path).items()
             if "/peer/" in key[0] or "/range/" in key[0]
         }
 
-    whole = saved("whole")
+    whole = save_and_read("whole")
     monkeypatch.setattr(chunk_builder, "CHUNK_BYTES", 1)
     monkeypatch.setattr(batch_reader, "JOINED_BYTES", 1)
     monkeypatch.setattr(scene, "MIN_BATCH_ROWS", 1)
-    pieces = saved("pieces")
+    pieces = save_and_read("pieces")
     assert len(whole[f"{TRUTH}/trail", "LineStrips3D:strips"]) == 20
     assert whole.keys() == pieces.keys()
     assert [key for key, values in whole.items() if values != pieces[key]] == []
@@ -274,27 +283,29 @@ def test_piloted_flight_shows_commands_maps_and_detection_gaps(tmp_path: Path, r
     settings = recipes.load("fly_follow", "fly", fly_stage.Settings, flags)
     fly_stage.run(tmp_path / "flight.mcap", settings)
     save([tmp_path / "flight.mcap"], rrd, Settings())
-    rows = logged(rrd)
+    rows = count_rows(rrd)
     for field in ("vx_mps", "vy_mps", "vz_mps"):
         assert rows[f"/cf1/command/{field}", "Scalars"] >= 20
     assert rows["/cf1/detections/sight", "StateChange"] == 10
     assert rows["/cf1/peer/cf2/truth/trail", "LineStrips3D"] >= 20
     assert rows["/cf2/peer/cf1/truth/trail", "LineStrips3D"] >= 19
-    shown = panels(rrd)
+    shown = read_panel_names(rrd)
     assert {"commands, m/s", "detections, per image", "cf1 confidence", "cf1 depth, m"} <= shown
-    states = column(rrd, "/cf1/detections/sight", "StateChange:state")
+    states = read_column(rrd, "/cf1/detections/sight", "StateChange:state")
     assert {state for (state,) in states} <= {"detected", "not detected"}
 
 
-def test_innovations_and_causes_of_a_pair_are_plots(fly: Make, rrd: Path, tmp_path: Path) -> None:
+def test_innovations_and_causes_of_a_pair_are_plots(
+    make_flight: Make, rrd: Path, tmp_path: Path
+) -> None:
     cause = {"name": "flow does not fit", "probability": 0.9, "from_s": 0.5, "to_s": 1.0}
     innovation = {"signal": "range", "at_s": [0.25, 1.5], "size": [0.5, 4.0]}
     made = message_class("PeerCauses")(causes=[{**cause, "robot": "cf2"}], innovations=[innovation])
     with RecordingWriter(tmp_path / "causes.mcap", Provenance("test")) as sink:
         sink.write(0, topics.CAUSES("cf1", "cf2"), made)
-    save([fly(), tmp_path / "causes.mcap"], rrd, Settings())
+    save([make_flight(), tmp_path / "causes.mcap"], rrd, Settings())
     path = topics.CAUSES("cf1", "cf2")
-    assert column(rrd, f"{path}/innovation/range", "Scalars:scalars") == [[0.5], [4.0]]
-    drawn = column(rrd, f"{path}/cause/cf2_flow_does_not_fit", "Scalars:scalars")
+    assert read_column(rrd, f"{path}/innovation/range", "Scalars:scalars") == [[0.5], [4.0]]
+    drawn = read_column(rrd, f"{path}/cause/cf2_flow_does_not_fit", "Scalars:scalars")
     assert [value for (value,) in drawn] == pytest.approx([0, 0, 0.9, 0.9, 0, 0])
-    assert {"innovations, sigmas", "causes, probability"} <= set(panels(rrd))
+    assert {"innovations, sigmas", "causes, probability"} <= set(read_panel_names(rrd))

@@ -19,17 +19,17 @@ PANELS = LAYOUT["configById"]
 LINES = [(name, line) for name, panel in PANELS.items() for line in panel.get("paths", ())]
 
 
-def leaves(node: Any) -> Iterator[str]:
-    """Panels that a layout shows."""
+def iter_panels(node: Any) -> Iterator[str]:
+    """Yield the panels of a layout."""
     if isinstance(node, str):
         yield node
     else:
-        yield from leaves(node["first"])
-        yield from leaves(node["second"])
+        yield from iter_panels(node["first"])
+        yield from iter_panels(node["second"])
 
 
 def test_every_panel_is_in_the_layout_once() -> None:
-    assert sorted(leaves(LAYOUT["layout"])) == sorted(PANELS)
+    assert sorted(iter_panels(LAYOUT["layout"])) == sorted(PANELS)
     assert all(panel["foxglovePanelTitle"] for panel in PANELS.values())
 
 

@@ -23,6 +23,7 @@ class Browser:
         self.address = f"{address}/session/{self._send('POST', '/session', wanted)['sessionId']}"
 
     def _send(self, method: str, path: str, body: Any = None) -> Any:
+        """Send a command; return its value."""
         data = None if body is None else json.dumps(body).encode()
         asked = request.Request(self.address + path, data, method=method)
         asked.add_header("Content-Type", "application/json")
@@ -30,27 +31,31 @@ class Browser:
             return json.loads(answer.read())["value"]
 
     def open(self, page: Path) -> None:
+        """Load a page."""
         self._send("POST", "/url", {"url": page.as_uri()})
 
     def run(self, script: str) -> Any:
-        """The value of a JavaScript function body."""
+        """Run the body of a JavaScript function; return its value."""
         return self._send("POST", "/execute/sync", {"script": script, "args": []})
 
     def find(self, selector: str) -> str:
+        """Return the identifier of an element."""
         found = self._send("POST", "/element", {"using": "css selector", "value": selector})
         return str(next(iter(found.values())))
 
     def click(self, selector: str) -> None:
+        """Click on an element."""
         self._send("POST", f"/element/{self.find(selector)}/click", {})
 
     def press(self, key: str) -> None:
+        """Press and release a key."""
         keys = [{"type": "keyDown", "value": key}, {"type": "keyUp", "value": key}]
         self._send(
             "POST", "/actions", {"actions": [{"type": "key", "id": "keys", "actions": keys}]}
         )
 
     def drag(self, start: tuple[float, float], end: tuple[float, float]) -> None:
-        """Press, move and release the pointer, pixels of the window."""
+        """Press, move and release the pointer; positions are pixels of the window."""
 
         def move(at: tuple[float, float]) -> dict[str, Any]:
             return {"type": "pointerMove", "duration": 50, "x": round(at[0]), "y": round(at[1])}
@@ -61,17 +66,19 @@ class Browser:
         self._send("POST", "/actions", {"actions": [pointer]})
 
     def screenshot(self, out: Path) -> None:
+        """Write a screenshot as PNG."""
         import base64  # noqa: PLC0415
 
         out.write_bytes(base64.b64decode(self._send("GET", "/screenshot")))
 
     def close(self) -> None:
+        """End the session."""
         self._send("DELETE", "")
 
 
 @contextmanager
 def open_browser(downloads: Path, width_px: int = 1200, height_px: int = 900) -> Iterator[Browser]:
-    """A browser without a screen, whose downloads go to a folder."""
+    """Open a headless browser whose downloads go to a folder."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
@@ -96,7 +103,7 @@ def open_browser(downloads: Path, width_px: int = 1200, height_px: int = 900) ->
                 "profile.default_content_setting_values.automatic_downloads": 1,
             },
         }
-        if width_px < 500:  # a window cannot be so narrow
+        if width_px < 500:  # narrower than a window can be
             size = {"width": width_px, "height": height_px, "pixelRatio": 2.0}
             options["mobileEmulation"] = {"deviceMetrics": size}
         browser = Browser(address, options)
@@ -110,7 +117,7 @@ def open_browser(downloads: Path, width_px: int = 1200, height_px: int = 900) ->
 
 
 def wait_for(path: Path) -> bytes:
-    """The content of a download, when it is there."""
+    """Wait for a download; return its content."""
     until = time.monotonic() + 60
     while not path.exists():
         assert time.monotonic() < until, path

@@ -1,9 +1,9 @@
-"""Steps of the probability of a cause."""
+"""The probability of a cause is drawn as steps over its time spans."""
 
 from dmrl.viewer.content.causes import EDGE_S, _build_steps
 
 
-def test_a_cause_is_zero_between_its_stretches_alone() -> None:
+def test_probability_of_a_cause_is_zero_outside_its_spans() -> None:
     stretches = [
         {"from_s": 0.0, "to_s": 4.0, "probability": 0.5},
         {"from_s": 8.0, "to_s": 30.0, "probability": 1.0},

@@ -1,4 +1,4 @@
-"""Detections of maps that predict left out."""
+"""Faint detections: peaks of maps below the threshold of `dmrl predict`."""
 
 from typing import Any
 
@@ -10,8 +10,8 @@ from dmrl.viewer.content.faint_detections import find_faint
 ROWS, COLS = 4, 6
 
 
-def grid(**changed: Any) -> dict[str, Any]:
-    """A map with three peaks: of 0.9, of 0.004 and of 0.0004."""
+def make_grid(**changed: Any) -> dict[str, Any]:
+    """Return the fields of a map with peaks of 0.9, 0.004 and 0.0004."""
     cells = np.zeros((2, ROWS, COLS), "<f4")
     cells[0, 1, 1], cells[0, 3, 4], cells[0, 0, 5] = 0.9, 0.004, 0.0004
     cells[1] = 1.5
@@ -22,9 +22,9 @@ def grid(**changed: Any) -> dict[str, Any]:
 @pytest.mark.parametrize("stride_px", [8, 0])
 def test_peaks_that_no_detection_has_are_found(stride_px: int) -> None:
     told = [{"u_px": 15.0, "v_px": 14.0, "depth_m": 1.4, "confidence": 0.9}]
-    (faint,) = find_faint(grid(stride_px=stride_px), told)
+    (faint,) = find_faint(make_grid(stride_px=stride_px), told)
     assert faint == pytest.approx({"u_px": 36, "v_px": 28, "depth_m": 1.5, "confidence": 0.004})
-    assert len(find_faint(grid(), [])) == 2
+    assert len(find_faint(make_grid(), [])) == 2
 
 
 @pytest.mark.parametrize(
@@ -39,5 +39,5 @@ def test_peaks_that_no_detection_has_are_found(stride_px: int) -> None:
     ],
 )
 def test_a_map_that_does_not_fit_has_no_peaks(changed: dict[str, Any]) -> None:
-    assert find_faint(grid(**changed), []) == []
+    assert find_faint(make_grid(**changed), []) == []
     assert find_faint({}, []) == []

@@ -1,4 +1,4 @@
-"""Drawing of recorded poses and positions, valid or not."""
+"""Poses, positions and ranges are parsed for drawing, with invalid ones left out."""
 
 import warnings
 
@@ -11,7 +11,8 @@ from dmrl.viewer.content.robot_motion import parse_poses, parse_positions, parse
 HOSTILE = [float("nan"), float("inf"), -float("inf"), 1e300, -1e300]
 
 
-def transforms(xyz: list[list[float]], xyzw: list[list[float]]) -> pa.RecordBatch:
+def make_transforms(xyz: list[list[float]], xyzw: list[list[float]]) -> pa.RecordBatch:
+    """Return transforms of cf1 every 10 ns with these positions and quaternions."""
     parts = [
         {
             "parent_frame_id": "map",
@@ -28,19 +29,19 @@ def transforms(xyz: list[list[float]], xyzw: list[list[float]]) -> pa.RecordBatc
 
 @pytest.mark.parametrize("bad", [*HOSTILE, 0.0])
 def test_invalid_poses_are_omitted_without_warnings(bad: float) -> None:
-    """A pose of numbers that are none, or a turn of length zero, between two sound ones."""
+    """One pose between valid ones is not finite or has a quaternion of length zero."""
     still, turn = [1.0, 2.0, 3.0], [0.0, 0.0, 0.0, 1.0]
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         places, turns = [still, [bad] * 3, still, still], [turn, [bad] * 4, turn, turn]
-        found = parse_poses(transforms(places, turns))["cf1"]
+        found = parse_poses(make_transforms(places, turns))["cf1"]
         seen = found.to_parent(np.array([[0.5, 0.0, 0.0]] * 4), np.array([-5, 5, 10, 35]))
     assert seen[[0, 3]].tolist() == [[1.5, 2.0, 3.0]] * 2
     assert np.isnan(seen[[1, 2]]).all()
 
 
-def test_turns_have_length_one() -> None:
-    found = parse_poses(transforms([[0.0] * 3], [[0.0, 0.0, 2.0, 2.0]]))["cf1"]
+def test_quaternions_are_normalized() -> None:
+    found = parse_poses(make_transforms([[0.0] * 3], [[0.0, 0.0, 2.0, 2.0]]))["cf1"]
     assert found.xyzw[0] == pytest.approx([0, 0, 0.5**0.5, 0.5**0.5])
 
 

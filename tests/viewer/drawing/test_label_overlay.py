@@ -26,7 +26,7 @@ def test_label_texts_do_not_overlap() -> None:
 
 
 def test_texts_of_two_estimates_do_not_overlap() -> None:
-    # The upper one's text has its own place, the lower one's would stand on it.
+    # The text of the lower label would cover that of the upper one.
     tops = np.array([[100.0, 80.0], [110.0, 90.0]])
     places = _place_texts(tops, tops[:, 1], np.zeros(2, int), 320)
     assert abs(places[0, 1] - places[1, 1]) >= 320 / 12 - 0.5
@@ -39,7 +39,7 @@ def test_an_estimate_near_the_upper_edge_has_its_text_below_that_of_a_detection(
 
 
 def test_more_confident_of_overlapping_detections_keeps_its_text() -> None:
-    # Where, and how sure; the two images hold the same.
+    # Position, pixels, and confidence of each detection of two equal images.
     near = [(100.0, 80.0, 0.5), (130.0, 90.0, 0.9), (130.0, 180.0, 0.6), (260.0, 90.0, 0.7)]
     found = [dict(zip(("u_px", "v_px", "confidence"), d, strict=True)) for d in near]
     rows = [{"threshold": 0.4, "detections": [{**d, "depth_m": 1.0} for d in found]}] * 2

@@ -1,4 +1,4 @@
-"""The live view while robots are recorded, read back from an .rrd file."""
+"""The live view of a recording session, read back from an .rrd file."""
 
 from collections import Counter
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""The page server: who gets an answer, and what the page may load."""
+"""The page server: which requests are answered, and what the page may load."""
 
 import http.client
 from collections.abc import Iterator
@@ -17,19 +17,23 @@ pytestmark = pytest.mark.heavy
 
 @pytest.fixture(scope="module")
 def server() -> Iterator[PageServer]:
+    """Return a server with complete data."""
     with closing(PageServer(Web())) as opened:
         opened.data.write(b"recording")
         opened.data.complete.set()
         yield opened
 
 
-def ask(server: PageServer, name: str, **headers: str) -> tuple[int, dict[str, str], bytes]:
-    """Ask for a file under the token; return status, headers and body."""
+def request_file(
+    server: PageServer, name: str, **headers: str
+) -> tuple[int, dict[str, str], bytes]:
+    """Request a file under the token; return status, headers and body."""
     address = urlsplit(server.url)
-    return ask_path(address.port or 0, address.path + name, **headers)
+    return request_path(address.port or 0, address.path + name, **headers)
 
 
-def ask_path(port: int, path: str, **headers: str) -> tuple[int, dict[str, str], bytes]:
+def request_path(port: int, path: str, **headers: str) -> tuple[int, dict[str, str], bytes]:
+    """Request a path; return status, headers and body."""
     with closing(http.client.HTTPConnection("127.0.0.1", port, timeout=30)) as connection:
         connection.request("GET", path, headers=headers)
         answer = connection.getresponse()
@@ -37,15 +41,15 @@ def ask_path(port: int, path: str, **headers: str) -> tuple[int, dict[str, str],
 
 
 def test_the_page_and_its_data_are_served_under_the_token(server: PageServer) -> None:
-    status, headers, page = ask(server, "")
+    status, headers, page = request_file(server, "")
     assert (status, headers["Content-Type"]) == (200, "text/html; charset=utf-8")
     assert b"<canvas" in page
-    assert ask(server, DATA_NAME)[2] == b"recording"
-    assert ask(server, "re_viewer_bg.wasm")[2].startswith(b"\0asm")
+    assert request_file(server, DATA_NAME)[2] == b"recording"
+    assert request_file(server, "re_viewer_bg.wasm")[2].startswith(b"\0asm")
 
 
 def test_the_page_may_call_no_other_host(server: PageServer) -> None:
-    _, headers, page = ask(server, "")
+    _, headers, page = request_file(server, "")
     policy = dict(
         part.strip().split(" ", 1) for part in headers["Content-Security-Policy"].split(";")
     )
@@ -62,25 +66,25 @@ def test_the_page_may_call_no_other_host(server: PageServer) -> None:
 )
 def test_another_host_is_refused(server: PageServer, host: str) -> None:
     for name in ("", DATA_NAME):
-        status, _, body = ask(server, name, Host=host)
+        status, _, body = request_file(server, name, Host=host)
         assert status == 403
         assert b"recording" not in body
 
 
 @pytest.mark.parametrize("host", ["localhost", "LOCALHOST:1", "127.0.0.1", "[::1]:80"])
 def test_names_of_this_computer_are_answered(server: PageServer, host: str) -> None:
-    assert ask(server, DATA_NAME, Host=host)[0] == 200
+    assert request_file(server, DATA_NAME, Host=host)[0] == 200
 
 
 def test_request_without_token_is_refused(server: PageServer) -> None:
     port = urlsplit(server.url).port or 0
     for path in ("/", f"/{DATA_NAME}", f"/token/{DATA_NAME}", "/../etc/passwd", "/re_viewer.js"):
-        assert ask_path(port, path)[0] == 404
+        assert request_path(port, path)[0] == 404
 
 
 def test_files_outside_the_page_are_not_served(server: PageServer) -> None:
     for name in ("../", "../../etc/passwd", "%2e%2e/etc/passwd", "index.html", "x.rrd"):
-        assert ask(server, name)[0] == 404
+        assert request_file(server, name)[0] == 404
 
 
 def test_a_second_server_has_another_token(server: PageServer) -> None:
@@ -91,8 +95,8 @@ def test_a_second_server_has_another_token(server: PageServer) -> None:
 def test_a_server_of_the_network_answers_addresses_and_not_names() -> None:
     with closing(PageServer(Web(bind="0.0.0.0"))) as opened:
         opened.data.complete.set()
-        assert ask(opened, DATA_NAME, Host="192.0.2.7:80")[0] == 200
-        assert ask(opened, DATA_NAME, Host="evil.example")[0] == 403
+        assert request_file(opened, DATA_NAME, Host="192.0.2.7:80")[0] == 200
+        assert request_file(opened, DATA_NAME, Host="evil.example")[0] == 403
 
 
 def test_one_port_is_open(server: PageServer) -> None:
@@ -100,6 +104,8 @@ def test_one_port_is_open(server: PageServer) -> None:
     if not children.is_dir():
         pytest.skip("no /proc")
     found = "".join(path.read_text() for path in children.glob("*/children")).split()
-    # Other tests of this process may have left a helper of multiprocessing.
+    # Ignore helpers of multiprocessing that other tests of this process have left.
     programs = [Path(f"/proc/{number}/cmdline").read_bytes() for number in found]
-    assert not [words for words in programs if b"rerun" in words], "the viewer's program runs on"
+    assert not [words for words in programs if b"rerun" in words], (
+        "the program of the viewer still runs"
+    )

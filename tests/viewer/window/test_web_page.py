@@ -1,4 +1,4 @@
-"""The page in a headless browser: what a user sees, and that it draws."""
+"""The web page of the viewer draws in a headless browser."""
 
 import base64
 import json
@@ -37,7 +37,7 @@ FLAGS = (
 
 
 class Browser:
-    """Chromium, spoken to as the WebDriver standard says."""
+    """Chromium, controlled by the WebDriver protocol."""
 
     def __init__(self, port: int, profile: Path) -> None:
         self.address = f"http://127.0.0.1:{port}"
@@ -47,19 +47,21 @@ class Browser:
         self.address += f"/session/{session['sessionId']}"
 
     def call(self, path: str, body: dict[str, Any] | None = None, method: str | None = None) -> Any:
+        """Send a command; return its value."""
         where = self.address if "/session" in self.address else f"{self.address}/session"
         data = None if body is None else json.dumps(body).encode()
         request = urllib.request.Request(where + path, data, method=method)
         with urllib.request.urlopen(request, timeout=PATIENCE_S) as answer:
             return json.loads(answer.read())["value"]
 
-    def picture(self) -> Rgb:
+    def take_screenshot(self) -> Rgb:
+        """Return a screenshot."""
         return decode(base64.b64decode(self.call("/screenshot")))
 
 
 @pytest.fixture
 def browser(tmp_path: Path) -> Iterator[Browser]:
-    """A browser with an empty profile. Skips where there is none."""
+    """Return a browser with an empty profile, or skip where there is none."""
     program = shutil.which("chromedriver")
     if program is None:
         pytest.skip("no browser; apt-get install chromium chromium-driver")
@@ -80,6 +82,7 @@ def browser(tmp_path: Path) -> Iterator[Browser]:
 
 
 def _wait_for(address: str) -> None:
+    """Wait until an address is served."""
     deadline = time.monotonic() + PATIENCE_S
     while True:
         try:
@@ -92,14 +95,14 @@ def _wait_for(address: str) -> None:
             return
 
 
-def share(rgb: Rgb, colour: tuple[int, int, int]) -> float:
-    """Share of pixels that have nearly this colour."""
+def measure_share(rgb: Rgb, colour: tuple[int, int, int]) -> float:
+    """Return the share of pixels that have nearly this colour."""
     return float((abs(rgb.astype(int) - colour).max(axis=2) < 12).mean())
 
 
 @pytest.mark.slow
-def test_a_browser_shows_the_flight(fly: Make, browser: Browser) -> None:
-    page = Page([fly()], Settings())
+def test_a_browser_shows_the_flight(make_flight: Make, browser: Browser) -> None:
+    page = Page([make_flight()], Settings())
     try:
         browser.call("/url", {"url": page.url})
         page.send_data()
@@ -107,11 +110,11 @@ def test_a_browser_shows_the_flight(fly: Make, browser: Browser) -> None:
         shown: dict[str, float] = {"nothing": 0.0}
         names = ("truth", "estimate", "detection", "range")
         while min(shown.values()) == 0 and time.monotonic() < deadline:
-            # A browser that draws without a graphics card may be too busy to answer.
+            # Software rendering may keep the browser too busy to answer.
             with suppress(urllib.error.HTTPError):
-                rgb = browser.picture()
-                shown = {name: share(rgb, RGB[name]) for name in names}
-        # The distance plot has the ranges, the image the boxes, the legends every colour.
+                rgb = browser.take_screenshot()
+                shown = {name: measure_share(rgb, RGB[name]) for name in names}
+        # Ranges are in the distance plot, boxes in the image, and all colours in the legends.
         assert min(shown.values()) > 0, shown
         assert "Rerun" in browser.call("/title")
     finally:
