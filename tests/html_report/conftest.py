@@ -1,3 +1,5 @@
+"""Outputs for reports."""
+
 import json
 import shutil
 from collections.abc import Callable
@@ -11,16 +13,17 @@ import dmrl
 from dmrl.images.codec import encode_png
 
 
-def figure(value: float | None) -> dict[str, float | None]:
+def make_figure(value: float | None) -> dict[str, float | None]:
+    """Return a figure with a confidence interval of 10 %."""
     low = None if value is None else value * 0.9
     return {"value": value, "low": low, "high": None if value is None else value * 1.1}
 
 
-def evaluation(**changes: Any) -> dict[str, Any]:
-    """A document of dmrl evaluate, made up."""
+def make_evaluation(**changes: Any) -> dict[str, Any]:
+    """Return an invented document of `dmrl evaluate`."""
     names = ("median_px", "within_8_px", "within_20_px", "depth_mae_m")
     names += ("precision", "recall", "f1", "ap_16_px")
-    band = {name: figure(0.5) for name in names}
+    band = {name: make_figure(0.5) for name in names}
     bands = [{"from_m": a, "to_m": b, **band} for a, b in ((0.0, 1.0), (1.0, None))]
     curves = {
         "confidence": [0.9, 0.5],
@@ -45,12 +48,13 @@ def evaluation(**changes: Any) -> dict[str, Any]:
 
 @pytest.fixture(name="evaluation")
 def evaluation_fixture() -> Callable[..., dict[str, Any]]:
-    return evaluation
+    """Return a function that returns a document of `dmrl evaluate`."""
+    return make_evaluation
 
 
 @pytest.fixture(scope="session")
 def flights(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A flight, and the same with positions."""
+    """Return a folder with a flight and its labelled copy."""
     folder = tmp_path_factory.mktemp("flights")
     flight = dmrl.fly(folder / "flight.mcap", duration_s=20.0, noise="calibrated", seed=1)
     dmrl.label(flight, folder / "labelled.mcap")
@@ -59,12 +63,12 @@ def flights(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def outputs(tmp_path: Path, flights: Path) -> Path:
-    """A labelled flight, an evaluation, a model and a picture."""
+    """Return a folder with flights, an evaluation, a model and images."""
     folder = tmp_path / "out"
     shutil.copytree(flights, folder)
     (folder / "judged").mkdir()
     (folder / "model").mkdir()
-    (folder / "judged/evaluation.json").write_text(json.dumps(evaluation()))
+    (folder / "judged/evaluation.json").write_text(json.dumps(make_evaluation()))
     picture = encode_png(np.zeros((8, 8, 3), np.uint8))
     (folder / "judged/examples.png").write_bytes(picture)
     (folder / "view.png").write_bytes(picture)

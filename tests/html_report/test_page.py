@@ -1,4 +1,4 @@
-"""The page of a folder shows what is there, needs nothing else, and survives odd documents."""
+"""The report of a folder shows its outputs, loads no other file, and tolerates invalid ones."""
 
 import json
 import re
@@ -22,8 +22,8 @@ from dmrl.plots.image_figures import _place_texts
 Evaluation = Callable[..., dict[str, Any]]
 
 
-class _Seen(HTMLParser):
-    """Tags, the addresses in them, and the headings."""
+class _PageParser(HTMLParser):
+    """Collects the tags, addresses and headings of a page."""
 
     def __init__(self, html: str) -> None:
         super().__init__()
@@ -48,7 +48,7 @@ class _Seen(HTMLParser):
 @pytest.mark.heavy
 def test_report_shows_outputs_and_loads_nothing_external(outputs: Path) -> None:
     html = build_report(collect_outputs(outputs))
-    seen = _Seen(html)
+    seen = _PageParser(html)
     wanted = ["Detections", "Positions", "Training", "Images", "Recordings"]
     assert seen.headings == [*wanted, "Provenance"]
     assert not seen.tags & {"script", "link", "iframe", "object", "embed", "form"}
@@ -56,7 +56,7 @@ def test_report_shows_outputs_and_loads_nothing_external(outputs: Path) -> None:
     assert "url(" not in re.sub(r"url\(#", "", html) and "@import" not in html
     assert "default-src 'none'" in html
     assert html.count("<svg") >= 6 and html.count("data:image/png") == 2
-    assert "0.50 [0.45,\u00a00.55]" in html  # breaks before the bracket only
+    assert "0.50 [0.45,\u00a00.55]" in html  # a line may break before the bracket only
     assert "24778" in html and "flight.mcap" in html
     assert "cf2 relative to cf1, from above; 95 % ellipses" in html
     assert "detection minus label" in html and ">0 to 1 m<" in html and "median error, px" in html
@@ -74,7 +74,7 @@ def test_report_of_images_has_card_figures_and_no_positions(
     html = build_report(collect_outputs(tmp_path))
     assert all(f"dataset: {name}<" in html for name in {*drawn, "samples"})
     assert re.search(r">dataset</td><td[^>]*>train</td><td[^>]*>6</td>", html)
-    assert "Positions" not in _Seen(html).headings
+    assert "Positions" not in _PageParser(html).headings
 
 
 @pytest.mark.heavy
@@ -87,12 +87,12 @@ def test_names_and_documents_cannot_become_markup(outputs: Path, evaluation: Eva
     (outputs / "model/model.json").write_text(json.dumps(about))
     (outputs / "<img src=x>").mkdir()
     (outputs / "<img src=x>/evaluation.json").write_text(json.dumps(document))
-    seen = _Seen(build_report(collect_outputs(outputs)))
+    seen = _PageParser(build_report(collect_outputs(outputs)))
     assert "script" not in seen.tags and "x" not in seen.places
 
 
 @pytest.mark.heavy
-def test_documents_that_are_not_as_they_should_be_leave_the_rest(
+def test_invalid_documents_are_reported_and_the_rest_is_shown(
     outputs: Path, evaluation: Evaluation
 ) -> None:
     odd: list[Any] = [

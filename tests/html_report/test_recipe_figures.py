@@ -1,4 +1,4 @@
-"""The figures of a recipe come first on its page, drawn from what its steps wrote."""
+"""The figures of a recipe come first in the report, drawn from the outputs of its steps."""
 
 import json
 import shutil
@@ -46,7 +46,8 @@ named = ["float", "chip", "absent"]
 """.replace("JUDGED", "judged/evaluation.json")
 
 
-def maps(path: Path, factor: float) -> None:
+def write_maps(path: Path, factor: float) -> None:
+    """Write an image and its maps, scaled by a factor."""
     grid = np.linspace(0.1, 0.9, 12, dtype="<f4").reshape(3, 4) * factor
     picture = encode_png(np.zeros((24, 32, 3), np.uint8))
     with RecordingWriter(path, Provenance("test", {})) as sink:
@@ -60,6 +61,7 @@ def maps(path: Path, factor: float) -> None:
 
 @pytest.fixture
 def pipeline(outputs: Path) -> Path:
+    """Return the outputs of a recipe with figures."""
     (outputs / "recipe.toml").write_text(RECIPE)
     about = json.loads((outputs / "model/model.json").read_text())
     about["training"] = {
@@ -68,8 +70,8 @@ def pipeline(outputs: Path) -> Path:
     (outputs / "model/model.json").write_text(json.dumps(about))
     picture = encode_png(np.full((20, 30, 3), 90, np.uint8))
     (outputs / "judged/circles.png").write_bytes(picture)
-    maps(outputs / "float.mcap", 1.0)
-    maps(outputs / "chip.mcap", 0.5)
+    write_maps(outputs / "float.mcap", 1.0)
+    write_maps(outputs / "chip.mcap", 0.5)
     return outputs
 
 
@@ -90,7 +92,7 @@ def test_maps_show_their_difference_from_the_first(pipeline: Path) -> None:
     assert "against float" in html and ">1.000<" in html
     assert f"{np.abs(grid - 0.5 * grid).mean():.4f}" in html
     assert f"{2 * np.abs(grid - 0.5 * grid).mean():.4f}" in html
-    assert ">absent<" not in html  # an optional step, left out
+    assert ">absent<" not in html  # an optional step that was not run
 
 
 def test_figure_that_cannot_be_drawn_shows_its_reason(pipeline: Path) -> None:
@@ -119,7 +121,7 @@ def test_invalid_recipe_is_reported_on_the_report(pipeline: Path) -> None:
 
 
 def test_unusable_figure_sources_show_a_reason(pipeline: Path) -> None:
-    """No output is there, one has no picture, one is a folder: a sentence each."""
+    """The sources are a missing file, a recording without images, and a folder."""
     (pipeline / "chip.mcap").unlink()
     with RecordingWriter(pipeline / "chip.mcap", Provenance("test", {})) as sink:
         fields = {"rows": 1, "cols": 1, "channels": ("confidence", "depth_m"), "stride_px": 8}

@@ -1,3 +1,5 @@
+"""Simulated drones send the values and images of a recorded flight."""
+
 import socket
 import time
 
@@ -16,7 +18,7 @@ def test_blocks_at_the_pace_of_the_flight_send_every_value_once() -> None:
     assert [variable.value_at(moment) for moment in due_s] == list(range(2000))
 
 
-def test_a_camera_sends_no_image_of_the_time_in_which_it_was_dead() -> None:
+def test_a_camera_sends_no_image_of_its_dead_time() -> None:
     clock, faults = FlightClock(1.0, 9.0), SimulatedFaults(dead_s=(0.5, 0.9))
     clock.take_off()
     clock._start_s = time.monotonic() - 1.0

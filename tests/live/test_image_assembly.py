@@ -1,3 +1,5 @@
+"""Received images are decoded, coloured and cropped."""
+
 import numpy as np
 import pytest
 

@@ -1,4 +1,4 @@
-"""Times of the drone's clock, as its camera sends them with images."""
+"""Times of the drone's clock, which its camera sends with images, become host times."""
 
 from dmrl.live.crazyflie_link import CrazyflieLink, _LinkConnection
 from dmrl.live.log_blocks import LogDecoder, LogPlan
@@ -16,6 +16,6 @@ def test_images_of_a_drone_that_restarted_wait_for_its_new_clock() -> None:
     list(link._flight.add_packet("b", 12_000, {}, START_NS))
     link.health.last_arrival_ns = START_NS
     assert link.to_host_time_ns(12_000 + 50) == START_NS + S // 20
-    now[0] += 4 * S  # the log is silent, as when the radio loses it: the clock goes on
+    now[0] += 4 * S  # without log packets, for example after radio loss, the clock continues
     assert link.to_host_time_ns(12_000 + 4_000) == now[0]
     assert link.to_host_time_ns(300) is None  # the drone restarted

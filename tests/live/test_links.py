@@ -1,4 +1,4 @@
-"""Who is linked to, and whose ranges are recorded."""
+"""Links to robots and cameras, and the peers of recorded ranges."""
 
 from dataclasses import replace
 from pathlib import Path

@@ -1,3 +1,5 @@
+"""Log blocks of a Crazyflie: their layout, units and signs."""
+
 import math
 
 import pytest
@@ -63,7 +65,7 @@ def test_pitch_changes_its_sign_and_velocity_turns_with_the_robot() -> None:
     attitude, velocity = reading.iter_samples(5, values)
     assert attitude.fields["pitch_rad"] == pytest.approx(-math.radians(10))
     assert attitude.fields["roll_rad"] == pytest.approx(math.radians(5))
-    # Facing left of the take-off's x, it moves along its own x.
+    # The robot faces and moves along the world's y, hence along its own x.
     assert velocity.fields["vx_mps"] == pytest.approx(2.0)
     assert velocity.fields["vy_mps"] == pytest.approx(0.0)
 
@@ -71,7 +73,7 @@ def test_pitch_changes_its_sign_and_velocity_turns_with_the_robot() -> None:
 def test_the_turning_rate_is_about_the_vertical_not_the_body() -> None:
     reading = LogDecoder("cf1", plan_blocks(TOC, {}, 10))
     roll, rate = math.radians(20), math.radians(60)
-    # Turning about the vertical at 60 deg/s while rolled by 20 degrees.
+    # The robot turns about the vertical at 60 deg/s while it is rolled by 20 degrees.
     values = LEVEL | {"stateEstimate.roll": 20.0}
     values |= {"gyro.y": 60 * math.sin(roll), "gyro.z": 60 * math.cos(roll)}
     attitude, _ = reading.iter_samples(5, values)
@@ -101,7 +103,7 @@ def test_robots_are_numbered_by_the_end_of_their_names() -> None:
     assert [parse_robot_number(name) for name in ("cf2", "drone10", "leader")] == [2, 10, None]
 
 
-def test_a_block_is_as_long_as_cflib_lets_it_be() -> None:
+def test_limits_of_blocks_equal_those_of_cflib() -> None:
     assert pytest.importorskip("cflib.crazyflie.log").LogConfig.MAX_LEN == BLOCK_BYTES
     assert pytest.importorskip("cflib.crazyflie.log").Log.MAX_BLOCKS == MAX_BLOCKS
 
@@ -109,7 +111,7 @@ def test_a_block_is_as_long_as_cflib_lets_it_be() -> None:
 def test_turning_about_the_vertical_is_found_at_any_tilt() -> None:
     reading = LogDecoder("cf1", plan_blocks(TOC, {}, 10))
     for roll_deg, pitch_deg in ((20.0, 0.0), (0.0, 15.0), (-25.0, 10.0)):
-        # The log's pitch is nose up, and the body's rates are those of Ry(pitch) Rx(roll).
+        # The logged pitch is positive nose up. The attitude is Ry(pitch) Rx(roll).
         roll, pitch = math.radians(roll_deg), -math.radians(pitch_deg)
         values = LEVEL | {"stateEstimate.roll": roll_deg, "stateEstimate.pitch": pitch_deg}
         values |= {"gyro.y": 60 * math.cos(pitch) * math.sin(roll)}

@@ -1,4 +1,4 @@
-"""Lost packets are counted by the sender's own counters, over pauses and reconnections."""
+"""Lost packets are counted by the sender's clock or counter, across pauses and restarts."""
 
 from dataclasses import replace
 
@@ -14,8 +14,8 @@ START_NS = 1_700_000_000_000_000_000
 BLANK = Image(4, 4, "raw", bytes(16))
 
 
-def count(times_ms: np.ndarray, start_ms: int = 0, period_ms: int = 10) -> int:
-    """Feed the packets of these times; return how many are counted as lost."""
+def count_lost(times_ms: np.ndarray, start_ms: int = 0, period_ms: int = 10) -> int:
+    """Add the packets of these times; return the number that is counted as lost."""
     packets = PacketCount()
     return sum(
         packets.add_packet("b", period_ms, (start_ms + t) % (1 << 24), START_NS + t * MS)
@@ -27,17 +27,17 @@ def count(times_ms: np.ndarray, start_ms: int = 0, period_ms: int = 10) -> int:
 def test_a_pause_is_counted(start_ms: int) -> None:
     times = np.arange(0, 20_000, 10)
     kept = times[(times < 5_000) | (times >= 11_000)]
-    assert count(kept, start_ms) == 600
-    assert count(times, start_ms) == 0
+    assert count_lost(kept, start_ms) == 600
+    assert count_lost(times, start_ms) == 0
 
 
 def test_a_pause_longer_than_the_counter_is_counted() -> None:
     times = np.arange(0, 30_000_000, 1000)
     kept = times[(times < 5_000) | (times >= 25_000_000)]
-    assert count(kept, period_ms=1000) == len(times) - len(kept)
+    assert count_lost(kept, period_ms=1000) == len(times) - len(kept)
 
 
-def test_blocks_count_alone() -> None:
+def test_lost_packets_are_counted_per_block() -> None:
     packets = PacketCount()
     lost = 0
     for t in range(0, 1000, 10):
@@ -56,7 +56,7 @@ def test_packet_count_restarts_with_the_drone() -> None:
 
 
 def test_late_packets_are_not_lost() -> None:
-    """The radio holds packets back and sends them at once."""
+    """The radio may delay packets and send several at once."""
     packets = PacketCount()
     arrivals = [0, 10, 900, 900, 900, 910]
     lost = [packets.add_packet("b", 10, 10 * k, START_NS + t * MS) for k, t in enumerate(arrivals)]

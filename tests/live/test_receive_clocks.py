@@ -1,3 +1,5 @@
+"""Clocks of senders are estimated from arrival times with jitter."""
+
 import numpy as np
 import pytest
 
@@ -17,7 +19,7 @@ def test_a_drifting_clock_is_followed_to_a_millisecond_through_jitter(drift_ppm:
         clock.add_sample(sender_ns, true_ns + round((2 + rng.exponential(8)) * MS))
         if clock.settled:
             errors_ms.append((clock.to_host_ns(sender_ns) - true_ns) / MS)
-    # 2 ms is the least delay, which nobody can see.
+    # The smallest delay, 2 ms, cannot be observed.
     assert min(errors_ms) > 0.5
     assert max(errors_ms) < 2.5
 

@@ -1,4 +1,4 @@
-"""A session that fails names the file that holds the flight."""
+"""A recording session that fails names the file that holds the flight."""
 
 from pathlib import Path
 

@@ -1,3 +1,5 @@
+"""Omissions are counted by reason."""
+
 import pytest
 
 from dmrl.errors import SourceError
@@ -22,7 +24,7 @@ def test_omissions_are_counted_by_reason_and_reported_once(
     assert count_so_far() == {}
 
 
-def test_the_innermost_count_counts() -> None:
+def test_omissions_are_counted_by_the_innermost_context() -> None:
     with count_left_out() as outer:
         with count_left_out() as inner:
             leave_out("rows", "a")
@@ -30,7 +32,7 @@ def test_the_innermost_count_counts() -> None:
     assert (outer.counts["rows"], inner.counts["rows"]) == (1, 1)
 
 
-def test_strict_raises_at_the_first_thing(capsys: pytest.CaptureFixture[str]) -> None:
+def test_strict_raises_at_the_first_omission(capsys: pytest.CaptureFixture[str]) -> None:
     match = r"a\.csv:3: rows without a time: 1.*--strict"
     with pytest.raises(SourceError, match=match), count_left_out(strict=True):
         leave_out("rows without a time", "a.csv:3")

@@ -1,15 +1,17 @@
+"""Progress bars and messages on standard error."""
+
 import pytest
 
 from dmrl.terminal.progress import say, track
 
 
-def test_a_pipe_sees_no_bar(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_pipe_gets_no_bar(capsys: pytest.CaptureFixture[str]) -> None:
     assert list(track(range(5), "Counting")) == [0, 1, 2, 3, 4]
     assert list(track(iter("ab"), "Counting", 2)) == ["a", "b"]
     assert capsys.readouterr() == ("", "")
 
 
-def test_a_log_gets_a_line_now_and_then(
+def test_a_log_gets_periodic_lines(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("dmrl.terminal.progress.LOG_PERIOD_S", 0.0)
@@ -23,7 +25,7 @@ def test_a_log_gets_a_line_now_and_then(
     ]
 
 
-def test_a_terminal_sees_a_bar(
+def test_a_terminal_gets_a_bar(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("FORCE_COLOR", "1")

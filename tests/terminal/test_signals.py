@@ -1,4 +1,4 @@
-"""Signals to stop, as an event."""
+"""Signals that stop a command set an event."""
 
 import signal
 import threading
@@ -8,8 +8,8 @@ import pytest
 from dmrl.terminal.signals import set_on_signal
 
 
-class Destroyed:
-    """Gets a signal when it is destroyed, where Python drops exceptions."""
+class SignalInDestructor:
+    """Raises a signal when it is destroyed, where Python ignores exceptions."""
 
     def __init__(self, number: signal.Signals) -> None:
         self.number = number
@@ -23,7 +23,7 @@ def test_a_signal_amid_a_destructor_is_not_lost(number: signal.Signals) -> None:
     ended, before = threading.Event(), signal.getsignal(number)
     with set_on_signal(ended):
         assert not ended.is_set()
-        Destroyed(number)
+        SignalInDestructor(number)
         assert ended.is_set()
     assert signal.getsignal(number) is before
 

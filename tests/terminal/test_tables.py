@@ -1,3 +1,5 @@
+"""Tables, notes and JSON documents on standard output."""
+
 import json
 from pathlib import Path
 
