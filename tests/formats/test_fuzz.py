@@ -215,13 +215,13 @@ def _run_in_process(which: str, count: int, folder: Path) -> str:
 
 @pytest.mark.heavy
 @pytest.mark.parametrize("which", SOURCES)
-def test_damaged_sources_give_one_line_or_a_part(which: str, tmp_path: Path) -> None:
+def test_damaged_sources_are_refused_or_read(which: str, tmp_path: Path) -> None:
     run(which, 12, tmp_path)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("which", SOURCES)
-def test_two_thousand_damages_are_survived(
+def test_two_thousand_damaged_sources_are_refused_or_read(
     which: str, tmp_path: Path, request: pytest.FixtureRequest
 ) -> None:
     cases = round(2000 * float(os.environ.get("DMRL_FAULTS", "1")))

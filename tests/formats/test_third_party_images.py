@@ -229,7 +229,7 @@ def test_a_picture_that_is_broken_is_left_out_with_its_labels(
     assert len(read_images(tmp_path)) == 2
 
 
-def test_floats_have_no_range(convert: Convert, tmp_path: Path) -> None:
+def test_floating_point_images_are_left_out(convert: Convert, tmp_path: Path) -> None:
     (tmp_path / "in").mkdir()
     save(tmp_path / "in/a.tif", PIL.Image.fromarray(RAMP.astype(np.float32)))
     (tmp_path / "in/b.png").write_bytes(encode_png(COLOURS))
@@ -282,7 +282,7 @@ def test_implausible_depths_boxes_and_peers_are_reported(convert: Convert, tmp_p
     assert "doubt: 1 of 2 labels are of cf1, which carries the camera" in output
 
 
-def test_decoding_scales_what_recordings_hold_too() -> None:
+def test_recorded_16_bit_images_are_scaled() -> None:
     buffer = io.BytesIO()
     PIL.Image.fromarray(np.full((4, 4), 32768, np.uint16)).save(buffer, "PNG")
     assert (decode(buffer.getvalue()) == 128).all()

@@ -16,19 +16,19 @@ MS = 1_000_000
 
 
 @pytest.mark.parametrize("bits", [8, 24, 32])
-def test_a_counter_goes_on_where_it_wraps(bits: int) -> None:
+def test_wrapping_counter_is_unwrapped(bits: int) -> None:
     true = np.cumsum(np.random.default_rng(0).integers(1, 2 ** (bits - 1) - 1, 50))
     assert (unwrap(true % 2**bits, bits) - true == unwrap(true % 2**bits, bits)[0] - true[0]).all()
 
 
-def test_values_out_of_order_stay_so() -> None:
+def test_counter_values_out_of_order_are_kept() -> None:
     assert unwrap([255, 1, 0, 2], 8).tolist() == [255, 257, 256, 258]
     assert unwrap([], 8).tolist() == []
 
 
 @pytest.mark.parametrize("drop", [0.0, 0.05])
 @pytest.mark.parametrize("counted", [True, False])
-def test_jitter_of_arrival_is_taken_away(drop: float, counted: bool) -> None:
+def test_arrival_jitter_is_removed(drop: float, counted: bool) -> None:
     rng = np.random.default_rng(1)
     number = np.flatnonzero(rng.random(4000) >= drop)
     sent = 10**18 + number * 50_050_000  # the sender's clock is 0.1 % slow
@@ -139,7 +139,7 @@ def test_rate_is_estimated_from_the_last_64_arrivals() -> None:
 
 
 @pytest.mark.parametrize(("late", "stands"), [(3.7, False), (4.6, True)])
-def test_a_pause_is_of_more_than_four_paces(late: float, stands: bool) -> None:
+def test_pause_is_longer_than_four_periods(late: float, stands: bool) -> None:
     sender = SteadyRateFilter()
     for k in range(64):
         sender(50 * MS * k)
@@ -158,7 +158,7 @@ def test_nothing_is_sent_after_it_arrived_on_a_clock_of_today() -> None:
         assert sender(arrival) <= arrival
 
 
-def test_three_arrivals_are_evened_out_and_two_stand() -> None:
+def test_dejitter_needs_three_arrivals() -> None:
     assert dejitter([0, 10, 19]).tolist() == [0, 9, 19]
     assert dejitter([0, 10]).tolist() == [0, 10]
     assert dejitter([]).tolist() == []

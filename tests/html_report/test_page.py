@@ -200,7 +200,7 @@ def test_the_pooled_figures_of_a_comparison_are_not_shown(
         assert ("detection minus label" in html) == shown
 
 
-def test_columns_of_names_that_begin_with_a_digit_are_not_of_numbers() -> None:
+def test_names_that_begin_with_a_digit_are_not_numeric_columns() -> None:
     rows = [["2026-11/f1.mcap", "0.5 (0.4, 0.6)", "12"], ["7.mcap", "-", "99.1% (98%, 100%)"]]
     assert Table(("recording", "error", "within"), rows).kinds == ["", "n", "n"]
     assert Table(("R2",), [["0.12 [-0.4, 0.6]"], ["< -1"]]).kinds == ["n"]

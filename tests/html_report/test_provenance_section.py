@@ -41,7 +41,7 @@ def test_a_recording_that_is_elsewhere_or_there_twice_is_a_source() -> None:
 
 
 @pytest.mark.parametrize("document", [{}, {"recording": "seen.mcap"}, {"recording": {"name": 3}}])
-def test_documents_of_another_form_do_no_harm(document: dict[str, Any]) -> None:
+def test_invalid_documents_are_ignored_in_the_graph(document: dict[str, Any]) -> None:
     assert "predict" in build_section(document, "seen.mcap")[0]
 
 

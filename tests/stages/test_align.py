@@ -42,7 +42,9 @@ def recording(tmp_path: Path) -> Path:
 
 
 @pytest.mark.heavy
-def test_all_of_a_robot_is_set_by_the_other_s_clock(recording: Path, tmp_path: Path) -> None:
+def test_all_topics_of_a_robot_are_aligned_to_the_reference_clock(
+    recording: Path, tmp_path: Path
+) -> None:
     out = tmp_path / "out.mcap"
     clocks = run(recording, out, Settings())
     assert clocks["cf2"].offset_s == pytest.approx(29.92, abs=0.002)

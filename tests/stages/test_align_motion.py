@@ -93,12 +93,12 @@ def measure_camera_error_s(folder: Path, duration_s: float) -> float:
 
 
 @pytest.mark.heavy
-def test_a_camera_is_set_by_the_turns_it_saw(tmp_path: Path) -> None:
+def test_camera_is_aligned_by_its_image_motion(tmp_path: Path) -> None:
     assert measure_camera_error_s(tmp_path, 40.0) < 0.005
 
 
 @pytest.mark.slow
-def test_a_camera_is_set_to_5_ms_over_5_minutes(tmp_path: Path) -> None:
+def test_camera_is_aligned_to_5_ms_over_5_minutes(tmp_path: Path) -> None:
     assert measure_camera_error_s(tmp_path, 300.0) < 0.005
 
 
@@ -120,12 +120,12 @@ def measure_mocap_errors_s(folder: Path, duration_s: float, noise: Preset) -> li
 
 
 @pytest.mark.heavy
-def test_robots_are_set_by_motion_capture(tmp_path: Path) -> None:
+def test_robots_are_aligned_to_motion_capture(tmp_path: Path) -> None:
     assert max(measure_mocap_errors_s(tmp_path, 40.0, "calibrated")) < 0.005
 
 
 @pytest.mark.slow
-def test_robots_are_set_to_5_ms_over_5_minutes_by_motion_capture(tmp_path: Path) -> None:
+def test_robots_are_aligned_to_motion_capture_to_5_ms_over_5_minutes(tmp_path: Path) -> None:
     assert max(measure_mocap_errors_s(tmp_path, 300.0, "realistic")) < 0.005
 
 

@@ -82,7 +82,7 @@ def test_flags_without_effect_are_errors(
 
 
 @pytest.mark.heavy
-def test_a_stream_of_the_whole_sensor_is_cut_for_the_shipped_network(
+def test_full_sensor_stream_is_cropped_for_the_shipped_network(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Raw images of 324 x 244 px are cropped to 320 x 224 px, the size of the calibration."""

@@ -188,7 +188,7 @@ def test_images_that_cannot_be_judged_are_left_out_and_counted(
     assert measure(path, partial)["recall"] == 1
 
 
-def test_leaving_messages_out_does_not_flatter(
+def test_images_without_detections_count_as_misses(
     write: Callable[..., Path], capsys: pytest.CaptureFixture[str]
 ) -> None:
     good, bad = ([label(10, 10)], [detect(10, 10)]), ([label(10, 10)], [detect(50, 40, 0.2)])
@@ -231,7 +231,7 @@ def test_labels_without_images_are_omitted(write: Callable[..., Path], tmp_path:
     assert evaluation.pairs.left_out == {"labels without an image": 1}
 
 
-def test_the_split_of_the_source_is_kept_apart(write: Callable[..., Path]) -> None:
+def test_splits_of_the_source_are_evaluated_separately(write: Callable[..., Path]) -> None:
     images = [([label(10, 10)], [detect(10 + 10 * k, 10)]) for k in range(4)]
     path = write({"cf1": images}, {"train": "[[0, 2]]", "test": "[[3, 3]]"})
     assert measure(path, Settings(split="test", draws=5))["mean_px"] == 30

@@ -15,7 +15,7 @@ from .test_evaluate import FAST
 
 
 @pytest.mark.heavy
-def test_plots_are_whole_and_the_same_again(dots: Path, model: Path, tmp_path: Path) -> None:
+def test_plots_are_complete_and_reproducible(dots: Path, model: Path, tmp_path: Path) -> None:
     predict.run(model, dots, tmp_path / "out.mcap", predict.Settings())
     for name in ("a", "b"):
         run([tmp_path / "out.mcap"], tmp_path / name, FAST)

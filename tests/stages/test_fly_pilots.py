@@ -205,7 +205,7 @@ def test_every_shipped_pilot_flies_any_recipe(pilot: str, tmp_path: Path) -> Non
         assert counts["/{robot}/command"] == 21 * settings.flown
 
 
-def test_three_robots_of_a_formation_keep_apart(tmp_path: Path) -> None:
+def test_robots_of_a_formation_keep_their_distance(tmp_path: Path) -> None:
     out = tmp_path / "flight.mcap"
     flags = Flags(duration_s=15.0, eye="truth", seed=1)
     fly.run(out, recipes.load("fly_formation", "fly", Settings, flags))
@@ -302,7 +302,7 @@ def test_integer_and_c_backends_give_equal_commands(
     np.testing.assert_array_equal(flown[0], flown[1])
 
 
-def test_flights_with_one_place_share_the_room_only(tmp_path: Path) -> None:
+def test_flights_with_the_same_place_share_only_the_room(tmp_path: Path) -> None:
     first = []
     for name, seed, place in (("a", 1, None), ("b", 2, 1), ("c", 2, None)):
         out = tmp_path / f"{name}.mcap"

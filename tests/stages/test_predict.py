@@ -239,7 +239,7 @@ def test_fastest_backend_is_chosen_and_reported(
 
 
 @pytest.mark.heavy
-def test_torch_is_taken_where_onnx_would_not_do(
+def test_torch_is_chosen_where_onnx_is_unsuitable(
     random_model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert select_fastest_backend(random_model, (64, 48)) == "onnx"

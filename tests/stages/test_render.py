@@ -94,7 +94,7 @@ def _get_fields(settings: Settings) -> dict[str, object]:
 
 
 @pytest.mark.slow
-def test_a_killed_run_goes_on_to_the_same_bytes(blender: Path, tmp_path: Path) -> None:
+def test_killed_run_resumes_to_the_same_bytes(blender: Path, tmp_path: Path) -> None:
     # Lossless images are large, so that chunks fill up and are written early.
     recipe = tmp_path / "r.toml"
     recipe.write_text('kind = "render"\nimages = 24\nsamples = 1\nimage_format = "png"\n')

@@ -146,7 +146,7 @@ def test_missing_topic_is_reported(detected: Path, tmp_path: Path, topic: str, w
     assert not out.exists()
 
 
-def test_without_velocity_and_height_it_warns_and_goes_on(
+def test_tracking_without_velocity_and_height_warns(
     detected: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     short, out = tmp_path / "short.mcap", tmp_path / "out.mcap"

@@ -293,7 +293,7 @@ def test_the_last_images_of_a_recording_are_held_out(dots_dataset: Path) -> None
     )
 
 
-def test_shares_are_of_recordings_by_name(dots_dataset: Path, tmp_path: Path) -> None:
+def test_shares_select_recordings_by_name(dots_dataset: Path, tmp_path: Path) -> None:
     run(dots_dataset, tmp_path / "run", replace(SETTINGS, shares={"dots*": 0.7}))
     with pytest.raises(SettingError, match=r"no images left for flight-\*.*are dots\.mcap"):
         run(dots_dataset, tmp_path / "a", replace(SETTINGS, shares={"flight-*": 1.0, "*": 1.0}))

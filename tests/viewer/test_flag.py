@@ -109,7 +109,7 @@ def test_flag_page_needs_the_suffix_html(make_recording: Make, tmp_path: Path) -
 
 @pytest.mark.parametrize("what", [["set", "flight.mcap"], ["flight.mcap"]])
 @pytest.mark.heavy
-def test_suspicion_knows_the_peaks_of_maps_that_predict_left_out(
+def test_suspicion_uses_faint_peaks_of_the_maps(
     what: list[str], dataset_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     known: list[Any] = []

@@ -191,9 +191,7 @@ def test_a_track_disappears_when_it_ends(make_flight: Make, rrd: Path) -> None:
     assert read_column(rrd, "/cf1/tracks/covariance", "Ellipsoids3D:half_sizes")[19] == []
 
 
-def test_yaw_goes_on_where_it_turns_over(
-    make_flight: Make, rrd: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_yaw_is_unwrapped(make_flight: Make, rrd: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     # The yaw starts at 3.1 rad, grows by 0.01 rad a message, and is read in many batches.
     monkeypatch.setattr(scene, "MIN_BATCH_ROWS", 1)
     save([make_flight()], rrd, Settings())
@@ -203,7 +201,7 @@ def test_yaw_goes_on_where_it_turns_over(
     assert roll[0][0] == pytest.approx(np.degrees(0.1))
 
 
-def test_a_flight_without_images_is_shown_all_the_same(make_flight: Make, rrd: Path) -> None:
+def test_flight_without_images_is_shown(make_flight: Make, rrd: Path) -> None:
     assert save([make_flight(without=("camera", "labels", "detections"))], rrd, Settings()) == 0
     assert "cf1 image" not in read_panel_names(rrd)
     assert count_timed_rows(rrd)[POSITION, "Points3D"] == 20

@@ -224,7 +224,7 @@ def test_a_time_without_images_is_refused(make_recording: Make, rrd: Path) -> No
 
 
 @pytest.mark.parametrize("settings", [{"from_s": float("nan")}, {"to_s": float("inf")}])
-def test_a_time_that_is_none_is_refused(
+def test_non_finite_time_is_refused(
     make_recording: Make, rrd: Path, settings: dict[str, float]
 ) -> None:
     with pytest.raises(SettingError, match=r"s is not a time\. Give seconds from the start"):

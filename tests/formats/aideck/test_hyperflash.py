@@ -141,7 +141,7 @@ def test_bytes_of_something_else_are_refused(dump: Path) -> None:
             hyperflash.load_content(path, Options())
 
 
-def test_real_frames_are_behind_the_filters_that_are_assumed(data: Path) -> None:
+def test_bayer_order_matches_real_frames(data: Path) -> None:
     for number in ("00216", "00375", "00495"):
         rgb = decode((data / "aideck-frames" / f"img{number}.ppm").read_bytes())
         again = demosaic(to_bayer(rgb))[2:-2, 2:-2].astype(int)

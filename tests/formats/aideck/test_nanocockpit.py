@@ -71,7 +71,7 @@ def test_table_that_does_not_fit_gives_one_line_error(folder: Path) -> None:
         read_samples(folder)
 
 
-def test_a_row_of_other_numbers_is_left_out_with_its_line(folder: Path) -> None:
+def test_row_with_an_invalid_number_is_left_out_with_its_line(folder: Path) -> None:
     path = folder / "metadata.csv"
     assert ",10,255," in path.read_text()
     path.write_text(path.read_text().replace(",10,255,", ",10,x,"))
@@ -139,7 +139,7 @@ def test_given_calibration_is_written_before_the_images(folder: Path) -> None:
     assert len(images) == 6
 
 
-def test_colour_pictures_stand_in_for_raw_ones_as_they_are(folder: Path) -> None:
+def test_colour_images_are_used_if_raw_ones_are_missing(folder: Path) -> None:
     (folder / "camera_raw").rename(folder / "camera_rgb")
     jpegs = []
     for k, path in enumerate(sorted((folder / "camera_rgb").iterdir())):

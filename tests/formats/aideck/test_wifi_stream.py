@@ -59,7 +59,7 @@ def test_a_camera_of_another_size_is_refused(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("encoding", ["raw", "jpeg"])
 @pytest.mark.parametrize("camera", [None, AIDECK])
-def test_the_whole_sensor_is_cut_to_the_size_of_the_network(
+def test_full_sensor_images_are_cropped_to_the_network_s_size(
     encoding: Encoding, camera: Camera | None, tmp_path: Path
 ) -> None:
     raw = np.random.default_rng(0).integers(0, 256, (244, 324), np.uint8)

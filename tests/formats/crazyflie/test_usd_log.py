@@ -177,7 +177,7 @@ def test_interleaved_events_are_decoded(pattern: str, code: str) -> None:
     assert_equal_to_reference(usd_log.decode_log(raw), raw)
 
 
-def test_milliseconds_that_wrap_go_on() -> None:
+def test_wrapping_milliseconds_are_unwrapped() -> None:
     rows = [(1, (2**32 - 2 + k) % 2**32, (k,)) for k in range(5)]
     (block,) = usd_log.decode_log(plain_usd.encode({1: ("a", [("x", "H")])}, rows, 1)).blocks
     assert np.diff(block.time_ns).tolist() == [1_000_000] * 4

@@ -111,7 +111,9 @@ def test_the_state_of_a_real_flight_is_where_motion_capture_saw_it(data: Path) -
     assert np.median(error) < 0.02 and error.max() < 0.15
 
 
-def test_a_folder_is_a_robot_per_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_each_file_of_a_folder_is_a_robot(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     for name in ("cf1", "cf2"):
         (tmp_path / name).write_bytes(foreign.pack_usd_log())
     (tmp_path / "cf3").write_bytes(b"")

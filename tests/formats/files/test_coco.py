@@ -110,7 +110,7 @@ def test_invalid_coco_file_gives_one_line_error(text: str, tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize("place", ["bbox", "attributes"])
-def test_numbers_with_underscores_are_none(place: str, tmp_path: Path) -> None:
+def test_numbers_with_underscores_are_invalid(place: str, tmp_path: Path) -> None:
     document = make_coco_document("", [1], "")
     for annotation in document["annotations"]:
         annotation[place] = {"depth_m": "1_0"} if place == "attributes" else ["1_0", 2, 3, 4]
@@ -121,7 +121,7 @@ def test_numbers_with_underscores_are_none(place: str, tmp_path: Path) -> None:
     assert left.counts == {"pictures with a box that cannot be read": 1}
 
 
-def test_labels_of_ids_that_fit_no_picture_or_two_are_left_out(tmp_path: Path) -> None:
+def test_labels_without_exactly_one_image_are_left_out(tmp_path: Path) -> None:
     document = make_coco_document("", range(3), "")
     document["images"][2]["id"] = document["images"][1]["id"]
     (tmp_path / "a.json").write_text(json.dumps(document))
@@ -138,9 +138,7 @@ def test_labels_of_ids_that_fit_no_picture_or_two_are_left_out(tmp_path: Path) -
 
 
 @pytest.mark.parametrize("kind", [str, float])
-def test_ids_may_be_numbers_here_and_texts_there(
-    kind: Callable[[int], object], tmp_path: Path
-) -> None:
+def test_ids_may_be_numbers_or_strings(kind: Callable[[int], object], tmp_path: Path) -> None:
     document = make_coco_document("", [1, 2], "")
     for annotation in document["annotations"]:
         annotation |= {name: kind(annotation[name]) for name in ("image_id", "category_id")}
@@ -164,7 +162,7 @@ def test_a_picture_of_several_files_counts_once_and_in_its_split(tmp_path: Path)
     assert left.counts == {"pictures named again, in another JSON file or the same": 4}
 
 
-def test_attributes_of_other_programs_leave_the_peer_and_the_source(tmp_path: Path) -> None:
+def test_foreign_attributes_do_not_change_peer_and_source(tmp_path: Path) -> None:
     document = make_coco_document("", [1], "")
     for annotation in document["annotations"]:
         annotation["attributes"] = {"peer": "", "source": "manual"}

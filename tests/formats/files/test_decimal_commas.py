@@ -29,7 +29,7 @@ def test_commas_that_may_separate_thousands_are_refused(
         (("-0,125", "-2,000"), [-0.125, -2.0]),
     ],
 )
-def test_one_number_that_thousands_cannot_have_decides(
+def test_one_unambiguous_number_decides_the_meaning_of_commas(
     cells: tuple[str, str], numbers: list[float], tmp_path: Path
 ) -> None:
     path = tmp_path / "a.csv"
@@ -38,7 +38,7 @@ def test_one_number_that_thousands_cannot_have_decides(
     assert values is not None and values.tolist() == numbers
 
 
-def test_a_typed_minus_is_a_minus(tmp_path: Path) -> None:
+def test_unicode_minus_is_a_minus(tmp_path: Path) -> None:
     (path := tmp_path / "a.csv").write_text("t,x\n1,\u22122.5\n2,3\n", encoding="utf-8")
     found = read_table(path).parse_numbers("x")
     assert found is not None and found.tolist() == [-2.5, 3.0]

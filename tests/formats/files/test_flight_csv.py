@@ -156,7 +156,7 @@ def test_columns_of_no_known_name_are_counted(flight: Path) -> None:
     assert left.first["columns of no known name"].endswith("cf1.csv: range_cf2")
 
 
-def test_too_little_is_refused(flight: Path, tmp_path: Path) -> None:
+def test_incomplete_flight_is_refused(flight: Path, tmp_path: Path) -> None:
     write_log(flight, "cf2", make_rows()[:1])
     assert "fewer than two rows" in catch_error(flight)
     assert "no <robot>.csv in" in catch_error(tmp_path)
@@ -281,7 +281,7 @@ def test_true_peer_position_needs_three_coordinates(flight: Path) -> None:
     assert not [s for s in flight_csv.load_content(flight).samples if s.topic.endswith("truth")]
 
 
-def test_times_end_with_63_bits(flight: Path) -> None:
+def test_times_beyond_63_bits_are_left_out(flight: Path) -> None:
     for robot in ("cf1", "cf2"):
         write_log(flight, robot, [[9223372018 + k, *row[1:]] for k, row in enumerate(make_rows())])
     with count_left_out() as left_out:

@@ -116,7 +116,7 @@ def test_one_peer_may_have_labels_of_several_sources(tmp_path: Path) -> None:
         write_and_read(tmp_path, format_rows(LabelRow("a.png", ""), rows[0]))
 
 
-def test_a_picture_has_so_many_rows_at_most(
+def test_number_of_rows_of_an_image_is_limited(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(limits, "PEERS", 3)

@@ -255,7 +255,7 @@ def test_times_are_whole_nanoseconds_of_63_bits(
         assert read_samples(log, Options(columns=table))["/cf1/height"][0].time_ns == time_ns
 
 
-def test_a_folder_is_a_robot_per_file_by_its_name(table: Path) -> None:
+def test_each_file_of_a_folder_is_a_robot_with_its_name(table: Path) -> None:
     folder = table.with_name("logs")
     folder.mkdir()
     for name in ("a.csv", "b.CSV"):

@@ -83,7 +83,7 @@ def test_dates_are_times(
 
 
 @pytest.mark.parametrize("name", ["20241301120000", "20240230120000", "19691231235959"])
-def test_numbers_that_are_no_dates_are_none(
+def test_invalid_dates_are_not_times(
     name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for k in range(2):
@@ -115,7 +115,7 @@ def test_near_dates_are_refused_with_what_is_wrong(
     ("other", "why"),
     [("IMG_20240301_126000", "minute must be in 0..59"), ("a", "not like YYYYMMDD_hhmmss")],
 )
-def test_a_name_that_is_no_date_makes_all_times_nominal_with_a_line(
+def test_one_invalid_date_makes_all_times_nominal_and_is_reported(
     other: str, why: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for name in ("IMG_20240301_120000", other):
@@ -133,7 +133,7 @@ def test_a_name_that_is_no_date_makes_all_times_nominal_with_a_line(
         ("00012", False),
     ],
 )
-def test_a_time_beside_other_text_is_none_with_a_line(
+def test_times_beside_other_text_are_ignored_and_reported(
     name: str, said: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / f"{name}.png").write_bytes(b"")

@@ -315,7 +315,7 @@ def test_iso_times_are_parsed_as_by_pandas(moments: list[Any], between: str, zon
     assert [parse_time_ns(cell, 1e9, has_decimal_commas=False) for cell in cells] == wanted_ns
 
 
-def test_marks_of_comments_in_cells_are_kept(tmp_path: Path) -> None:
+def test_comment_marks_in_cells_are_kept(tmp_path: Path) -> None:
     path = tmp_path / "a.csv"
     path.write_text("t,bat,note,d2 # unit m\n0,80 %,lap #3,1.5\n1,79 %,lap #4,1.6 # far\n")
     with count_left_out() as left:

@@ -101,7 +101,7 @@ def test_the_attitude_differs_from_the_published_one_by_a_yaw_only() -> None:
 
 
 @pytest.mark.heavy
-def test_the_published_set_is_whole(data: Path) -> None:
+def test_published_set_is_complete(data: Path) -> None:
     images = locanet.load_images(data / "locanet-synthetic")
     assert [i.number for i in images] == list(range(882))
     splits = [i.split for i in images]
@@ -254,7 +254,7 @@ def test_two_sets_in_one_folder_are_not_mixed(folder: Path) -> None:
         locanet.load_images(folder)
 
 
-def test_without_boxes_and_splits_a_set_is_read_all_the_same(folder: Path) -> None:
+def test_set_without_boxes_and_splits_is_read(folder: Path) -> None:
     for name in ("boxLabel.txt", "train.txt", "test.txt"):
         (folder / "synImgs" / name).unlink()
         assert len(locanet.load_images(folder)) == 3

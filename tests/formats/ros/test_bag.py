@@ -36,7 +36,7 @@ def read_samples(source: Path, options: Options | None = None) -> dict[str, list
 
 @pytest.mark.parametrize("kind", ["sqlite3", "mcap", "ros1"])
 @pytest.mark.heavy
-def test_bags_of_every_kind_give_the_same(
+def test_all_kinds_of_bags_give_equal_samples(
     kind: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     source = write_bag(kind, tmp_path)

@@ -159,7 +159,7 @@ def test_ranges_outside_their_own_limits_are_left_out(
 
 
 @pytest.mark.parametrize("what", ["orientation", "angular_velocity"])
-def test_imu_without_orientation_or_rates_gives_no_attitude(
+def test_negative_covariance_marks_missing_imu_fields(
     what: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     level = {"orientation": xyzw(0.0, 0.0, 0.0, 1.0), "angular_velocity": xyzw(0.0, 0.0, 0.0)}

@@ -99,7 +99,7 @@ def test_a_server_of_the_network_answers_addresses_and_not_names() -> None:
         assert request_file(opened, DATA_NAME, Host="evil.example")[0] == 403
 
 
-def test_one_port_is_open(server: PageServer) -> None:
+def test_viewer_program_does_not_keep_running(server: PageServer) -> None:
     children = Path("/proc/self/task")
     if not children.is_dir():
         pytest.skip("no /proc")
