@@ -65,7 +65,7 @@ def test_the_readme_shows_commands() -> None:
 
 
 @pytest.fixture(scope="module")
-def generated() -> dict[Path, str]:
+def generated_pages() -> dict[Path, str]:
     """Return the pages as `make docs` would write them."""
     return dict(runpy.run_path(str(ROOT / "docs/build.py"))["pages"]())
 
@@ -74,8 +74,10 @@ def generated() -> dict[Path, str]:
     "page", ["docs/index.md", "docs/commands.md", "docs/formats.md", "dmrl/api/settings.pyi"]
 )
 @pytest.mark.heavy
-def test_generated_parts_are_fresh(page: str, generated: dict[Path, str]) -> None:
-    assert (ROOT / page).read_text(encoding="utf-8") == generated[ROOT / page], "run: make docs"
+def test_generated_parts_are_fresh(page: str, generated_pages: dict[Path, str]) -> None:
+    assert (ROOT / page).read_text(encoding="utf-8") == generated_pages[ROOT / page], (
+        "run: make docs"
+    )
 
 
 def find_links(page: Path) -> list[tuple[Path, str]]:

@@ -83,7 +83,7 @@ def _normalize_name(package: str) -> str:
 
 
 @pytest.fixture(scope="module")
-def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def dist_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Build the wheel and the sdist from a copy of the tracked files; return their folder."""
     source = tmp_path_factory.mktemp("source")
     out = tmp_path_factory.mktemp("dist")
@@ -110,9 +110,9 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def wheel(built: Path) -> zipfile.ZipFile:
+def wheel(dist_folder: Path) -> zipfile.ZipFile:
     """Return the opened wheel."""
-    return zipfile.ZipFile(next(built.glob("*.whl")))
+    return zipfile.ZipFile(next(dist_folder.glob("*.whl")))
 
 
 @pytest.mark.heavy
@@ -141,8 +141,8 @@ def test_a_wheel_holds_the_licence(wheel: zipfile.ZipFile) -> None:
 
 
 @pytest.mark.heavy
-def test_sdist_holds_the_files_of_a_build(built: Path) -> None:
-    with tarfile.open(next(built.glob("*.tar.gz"))) as archive:
+def test_sdist_holds_the_files_of_a_build(dist_folder: Path) -> None:
+    with tarfile.open(next(dist_folder.glob("*.tar.gz"))) as archive:
         names = {name.partition("/")[2] for name in archive.getnames()}
     wanted = {"pyproject.toml", "README.md", "LICENSE", "dmrl/py.typed", "schemas/dmrl.binpb"}
     wanted |= {str(p.relative_to(ROOT)) for p in ROOT.glob("schemas/dmrl/v1/*.proto")}

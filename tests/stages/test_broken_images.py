@@ -32,12 +32,12 @@ BROKEN = {
 }
 
 
-def write_recording(path: Path, broken: bytes, places: tuple[int, ...]) -> Path:
+def write_recording(path: Path, broken_image: bytes, places: tuple[int, ...]) -> Path:
     """Write six labelled images, those at ``places`` broken."""
     with RecordingWriter(path, Provenance("test")) as sink:
         for k in range(COUNT):
             kind = "png" if k % 2 else "jpeg"
-            data = broken if k in places else (PNG if k % 2 else JPEG)
+            data = broken_image if k in places else (PNG if k % 2 else JPEG)
             image = message_class("CompressedImage")(data=data, format=kind)
             peer = {"peer": "cf2", "u_px": 20, "v_px": 20, "depth_m": 1, "source": "hand"}
             sink.write(k * STEP_NS, CAMERA_IMAGE("cf1"), image)
@@ -46,15 +46,15 @@ def write_recording(path: Path, broken: bytes, places: tuple[int, ...]) -> Path:
 
 
 @pytest.fixture(params=list(BROKEN))
-def broken(request: pytest.FixtureRequest) -> bytes:
+def broken_image(request: pytest.FixtureRequest) -> bytes:
     """Return an image that cannot be decoded."""
     return BROKEN[request.param]
 
 
 @pytest.fixture(params=[0, 3, COUNT - 1])
-def recording(request: pytest.FixtureRequest, broken: bytes, tmp_path: Path) -> Path:
+def recording(request: pytest.FixtureRequest, broken_image: bytes, tmp_path: Path) -> Path:
     """Return a recording whose first, fourth or last image is broken."""
-    return write_recording(tmp_path / "in.mcap", broken, (request.param,))
+    return write_recording(tmp_path / "in.mcap", broken_image, (request.param,))
 
 
 Run = Callable[..., tuple[int, dict[str, Any], str]]
@@ -84,14 +84,16 @@ def find_time(recording: Path, data: bytes) -> int:
 
 @pytest.mark.heavy
 def test_predict_skips_broken_images(
-    run: Run, recording: Path, broken: bytes, model: Path, tmp_path: Path
+    run: Run, recording: Path, broken_image: bytes, model: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "out.mcap"
     rc, told, output = run("predict", model, recording, out, "--json", "--backend", "torch")
     assert (rc, told["images"], told["left_out"]) == (0, COUNT - 1, UNDECODABLE)
-    assert f"at {find_time(recording, broken)} ns" in output
+    assert f"at {find_time(recording, broken_image)} ns" in output
     times = [raw.time_ns for raw in read_raw(out, "/cf1/detections")]
-    assert sorted({*times, find_time(recording, broken)}) == [k * STEP_NS for k in range(COUNT)]
+    assert sorted({*times, find_time(recording, broken_image)}) == [
+        k * STEP_NS for k in range(COUNT)
+    ]
     assert len(times) == COUNT - 1
     made = read_summary(out).provenance
     assert made is not None and made.left_out == UNDECODABLE
@@ -101,30 +103,34 @@ def test_predict_skips_broken_images(
 
 @pytest.mark.heavy
 def test_dataset_skips_broken_images(
-    run: Run, recording: Path, broken: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    run: Run, recording: Path, broken_image: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rc, told, output = run("dataset", recording, tmp_path / "set", "--json", "--test-share", 0)
     assert (rc, told["left_out"]) == (0, {"cannot be decoded": 1})
-    assert f"at {find_time(recording, broken)} ns" in output
+    assert f"at {find_time(recording, broken_image)} ns" in output
     times = open_dataset(tmp_path / "set").split("train").table["log_time"].to_pylist()
-    assert sorted({*times, find_time(recording, broken)}) == [k * STEP_NS for k in range(COUNT)]
+    assert sorted({*times, find_time(recording, broken_image)}) == [
+        k * STEP_NS for k in range(COUNT)
+    ]
     assert len(times) == COUNT - 1
     rc, _, output = run("dataset", recording, tmp_path / "no", "--json", "--strict")
     assert rc == 1 and "--strict" in output and not list(tmp_path.glob("no*"))
 
 
-def test_check_reports_broken_images(run: Run, recording: Path, broken: bytes) -> None:
+def test_check_reports_broken_images(run: Run, recording: Path, broken_image: bytes) -> None:
     rc, told, _ = run("check", recording, "--json")
     texts = [finding["text"] for finding in told["findings"]]
-    wanted = f"1 messages contain no readable image: {find_time(recording, broken)} ns"
+    wanted = f"1 messages contain no readable image: {find_time(recording, broken_image)} ns"
     assert rc == 1 and wanted in texts
 
 
-def test_view_skips_broken_images(run: Run, recording: Path, broken: bytes, tmp_path: Path) -> None:
+def test_view_skips_broken_images(
+    run: Run, recording: Path, broken_image: bytes, tmp_path: Path
+) -> None:
     pytest.importorskip("rerun")
     rc, _, output = run("view", recording, "--save", tmp_path / "out.rrd")
     assert rc == 0
-    where = f"{CAMERA_IMAGE('cf1')} at {find_time(recording, broken)} ns"
+    where = f"{CAMERA_IMAGE('cf1')} at {find_time(recording, broken_image)} ns"
     assert f"left out: images that cannot be decoded: 1 (at {where})" in output
 
 
@@ -139,9 +145,9 @@ def test_evaluate_skips_broken_images(
 
 @pytest.mark.heavy
 def test_only_broken_images_are_an_error(
-    run: Run, broken: bytes, model: Path, tmp_path: Path
+    run: Run, broken_image: bytes, model: Path, tmp_path: Path
 ) -> None:
-    recording = write_recording(tmp_path / "in.mcap", broken, tuple(range(COUNT)))
+    recording = write_recording(tmp_path / "in.mcap", broken_image, tuple(range(COUNT)))
     for words in (("predict", model), ("dataset",), ("view",)):
         out = tmp_path / "out.mcap" if words[0] == "predict" else tmp_path / "out"
         flags = ("--save", tmp_path / "out.rrd") if words[0] == "view" else (out,)
@@ -165,10 +171,10 @@ def test_third_party_recording_with_broken_image_is_processed(
 
 
 def test_python_api_raises_one_error_for_broken_images(
-    broken: bytes, model: Path, tmp_path: Path
+    broken_image: bytes, model: Path, tmp_path: Path
 ) -> None:
     from dmrl.stages import predict  # noqa: PLC0415 - needs torch
 
-    recording = write_recording(tmp_path / "in.mcap", broken, tuple(range(COUNT)))
+    recording = write_recording(tmp_path / "in.mcap", broken_image, tuple(range(COUNT)))
     with pytest.raises(RecordingError, match="no image can be decoded"):
         predict.run(model, recording, tmp_path / "out.mcap", predict.Settings(backend="torch"))

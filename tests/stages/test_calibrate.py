@@ -32,7 +32,7 @@ TILTED = replace(AIDECK, mount_rad=(0.0, float(np.radians(-2.86)), 0.0), delay_s
 
 
 @pytest.fixture(scope="module")
-def seen(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def detected_flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return detections of a camera that is mounted crookedly and stamps its images late."""
     folder = tmp_path_factory.mktemp("calibrate")
     flight = folder / "flight.mcap"
@@ -41,10 +41,10 @@ def seen(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def calibrated(seen: Path) -> tuple[Path, calibrate.Result]:
+def calibration(detected_flight: Path) -> tuple[Path, calibrate.Result]:
     """Calibrate the camera by true positions; return its file and the result."""
-    out = seen.with_name("camera.toml")
-    return out, calibrate.run([seen], out, Settings(against="truth"))
+    out = detected_flight.with_name("camera.toml")
+    return out, calibrate.run([detected_flight], out, Settings(against="truth"))
 
 
 @pytest.fixture(scope="module")
@@ -58,8 +58,8 @@ def boards(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_mount_and_delay_come_from_a_flight(calibrated: tuple[Path, calibrate.Result]) -> None:
-    out, found = calibrated
+def test_mount_and_delay_come_from_a_flight(calibration: tuple[Path, calibrate.Result]) -> None:
+    out, found = calibration
     assert read_camera(out) == found.camera
     errors = np.degrees(np.subtract(found.camera.mount_rad, CROOKED.mount_rad))
     assert np.abs(errors).max() < 0.3
@@ -68,12 +68,12 @@ def test_mount_and_delay_come_from_a_flight(calibrated: tuple[Path, calibrate.Re
 
 @pytest.mark.parametrize("focal", [1.0, 1.25])
 def test_detections_that_the_camera_does_not_explain_are_doubted(
-    focal: float, seen: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    focal: float, detected_flight: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     near = replace(AIDECK, fx_px=focal * AIDECK.fx_px, fy_px=focal * AIDECK.fy_px)
     begin = tmp_path / "begin.toml"
     begin.write_text(format_camera(near))
-    calibrate.run([seen], tmp_path / "out.toml", Settings(against="truth", camera=begin))
+    calibrate.run([detected_flight], tmp_path / "out.toml", Settings(against="truth", camera=begin))
     said = capsys.readouterr().err
     assert ("doubt: half of its detections" in said) == (focal > 1)
     assert ("Check the intrinsics (--camera) and the model" in said) == (focal > 1)
@@ -103,15 +103,15 @@ def test_stated_errors_give_the_median_distance_of_detections() -> None:
 
 
 def test_calibration_moves_labels_closer_to_the_detections(
-    seen: Path, calibrated: tuple[Path, calibrate.Result], tmp_path: Path
+    detected_flight: Path, calibration: tuple[Path, calibrate.Result], tmp_path: Path
 ) -> None:
-    camera, _ = calibrated
+    camera, _ = calibration
     with_images = tmp_path / "images.mcap"
     blank = message_class("CompressedImage")(
         data=encode_png(np.zeros((224, 320, 3), np.uint8)), format="png"
     )
     with RecordingWriter(with_images, Provenance("test")) as sink:
-        for one in read(seen):
+        for one in read(detected_flight):
             sink.write(one.time_ns, one.topic, one.message)
             if one.topic == "/cf1/detections":
                 sink.write(one.time_ns, "/cf1/camera/image", blank)
@@ -190,15 +190,17 @@ def test_pictures_of_two_sizes_are_refused(boards: Path, tmp_path: Path) -> None
         calibrate.run([folder], tmp_path / "camera.toml", Settings(board="7x5"))
 
 
-def test_flight_without_positions_names_the_missing_topic(seen: Path, tmp_path: Path) -> None:
+def test_flight_without_positions_names_the_missing_topic(
+    detected_flight: Path, tmp_path: Path
+) -> None:
     with pytest.raises(MissingTopic, match="position"):
-        calibrate.run([seen], tmp_path / "camera.toml", Settings())
+        calibrate.run([detected_flight], tmp_path / "camera.toml", Settings())
 
 
-def test_detections_of_something_else_are_refused(seen: Path, tmp_path: Path) -> None:
+def test_detections_of_something_else_are_refused(detected_flight: Path, tmp_path: Path) -> None:
     wrong = tmp_path / "wrong.mcap"
     with RecordingWriter(wrong, Provenance("test")) as sink:
-        for one in read(seen):
+        for one in read(detected_flight):
             if one.topic == "/cf1/detections":
                 for detection in one.message.detections:
                     detection.u_px = 1.0
@@ -208,25 +210,25 @@ def test_detections_of_something_else_are_refused(seen: Path, tmp_path: Path) ->
 
 
 def test_positions_without_covariance_are_not_exact(
-    seen: Path, calibrated: tuple[Path, calibrate.Result], tmp_path: Path
+    detected_flight: Path, calibration: tuple[Path, calibrate.Result], tmp_path: Path
 ) -> None:
     unsaid = tmp_path / "unsaid.mcap"
     with RecordingWriter(unsaid, Provenance("test")) as sink:
-        for one in read(seen):
+        for one in read(detected_flight):
             if one.topic.endswith("/truth"):
                 del one.message.covariance[:]
             sink.write(one.time_ns, one.topic, one.message)
     unknown = calibrate.run([unsaid], tmp_path / "unsaid.toml", Settings(against="truth"))
-    assert unknown.camera.mount_rad != calibrated[1].camera.mount_rad
+    assert unknown.camera.mount_rad != calibration[1].camera.mount_rad
     errors = np.degrees(np.subtract(unknown.camera.mount_rad, CROOKED.mount_rad))
     assert np.abs(errors).max() < 0.5
 
 
-def test_an_existing_output_is_refused(seen: Path, tmp_path: Path) -> None:
+def test_an_existing_output_is_refused(detected_flight: Path, tmp_path: Path) -> None:
     out = tmp_path / "camera.toml"
     out.write_text("")
     with pytest.raises(OutputError):
-        calibrate.run([seen], out, Settings(against="truth"))
+        calibrate.run([detected_flight], out, Settings(against="truth"))
 
 
 def _write_labelled_flight(seed: int, folder: Path, camera: Camera) -> Path:
@@ -249,8 +251,10 @@ def _normalize_errors(sources: list[Path], out: Path, camera: Camera) -> np.ndar
 
 
 def test_sigmas_from_estimated_positions_cover_the_truth(tmp_path: Path) -> None:
-    seen = _write_labelled_flight(4000, tmp_path, CROOKED)
-    assert np.abs(_normalize_errors([seen], tmp_path / "camera.toml", CROOKED)).max() < 3.5
+    detected_flight = _write_labelled_flight(4000, tmp_path, CROOKED)
+    assert (
+        np.abs(_normalize_errors([detected_flight], tmp_path / "camera.toml", CROOKED)).max() < 3.5
+    )
 
 
 @pytest.mark.slow

@@ -319,7 +319,7 @@ def test_the_table_has_a_column_for_each_band_with_labels(
 
 
 @pytest.fixture(scope="module")
-def published(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def published_detections(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return the detections of the published weights on the published set."""
     folder = tmp_path_factory.mktemp("published")
     convert.run(data / "locanet-synthetic", folder / "in.mcap", convert.Settings())
@@ -337,9 +337,9 @@ def published(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     ],
 )
 def test_published_weights_have_the_published_figures(
-    published: Path, against: Any, wanted: dict[str, float]
+    published_detections: Path, against: Any, wanted: dict[str, float]
 ) -> None:
-    got = measure(published, Settings(against=against, split="test", draws=5))
+    got = measure(published_detections, Settings(against=against, split="test", draws=5))
     assert got["labels"] == 98
     for name in ("within_20_px", "within_8_px"):
         assert got[name] == pytest.approx(wanted[name], abs=0.002)

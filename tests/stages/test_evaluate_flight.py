@@ -15,7 +15,7 @@ from dmrl.stages.fly import Flags, Settings
 
 
 @pytest.fixture(scope="module")
-def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def piloted_flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a flight behind a leader that is missed in a third of the images, 10 s."""
     out = tmp_path_factory.mktemp("flight") / "flight.mcap"
     flags = Flags(duration_s=10.0, eye="ideal", camera=False, seed=2)
@@ -32,8 +32,8 @@ def evaluate_flight(path: Path, what: Any = "auto") -> dict[str, Any]:
 
 
 @pytest.mark.heavy
-def test_a_piloted_flight_is_evaluated_over_time(flown: Path) -> None:
-    (one,) = evaluate_flight(flown)["flights"]
+def test_a_piloted_flight_is_evaluated_over_time(piloted_flight: Path) -> None:
+    (one,) = evaluate_flight(piloted_flight)["flights"]
     assert (one["robot"], one["peer"]) == ("cf1", "cf2")
     assert one["held_s"] == pytest.approx(10.0, abs=0.1)
     assert one["contacts"] == 0
@@ -45,13 +45,15 @@ def test_a_piloted_flight_is_evaluated_over_time(flown: Path) -> None:
 
 
 @pytest.mark.heavy
-def test_tracks_of_such_a_flight_are_evaluated_on_request(flown: Path) -> None:
-    assert evaluate_flight(flown, "tracks")["robots"][0]["robot"] == "cf1"
+def test_tracks_of_such_a_flight_are_evaluated_on_request(piloted_flight: Path) -> None:
+    assert evaluate_flight(piloted_flight, "tracks")["robots"][0]["robot"] == "cf1"
 
 
-def test_flight_without_truth_is_refused(flown: Path, tmp_path: Path) -> None:
+def test_flight_without_truth_is_refused(piloted_flight: Path, tmp_path: Path) -> None:
     short = tmp_path / "short.mcap"
-    kept = [t for t in read_summary(flown).topics if not topics.parse_topic(topics.TRUTH, t)]
-    trim(flown, short, topics=[t for t in kept if t != "/tf"])
+    kept = [
+        t for t in read_summary(piloted_flight).topics if not topics.parse_topic(topics.TRUTH, t)
+    ]
+    trim(piloted_flight, short, topics=[t for t in kept if t != "/tf"])
     with pytest.raises(RecordingError, match="no true position"):
         evaluate_flight(short, "flight")

@@ -24,7 +24,7 @@ def make_position(x: float, y: float, std_m: float = 0.1, status: int = STATUS_O
 
 
 @pytest.fixture
-def labelled(tmp_path: Path) -> Path:
+def labelled_flight(tmp_path: Path) -> Path:
     """Return positions of two robots over 40 s.
 
     Those of cf1 have an error of 0.1 m in x and are unconverged for 10 s. Those of cf2 are exact
@@ -47,14 +47,14 @@ def labelled(tmp_path: Path) -> Path:
 
 
 @pytest.mark.heavy
-def test_positions_are_judged_pair_by_pair(labelled: Path) -> None:
-    one, other = positions.judge(labelled)
+def test_positions_are_judged_pair_by_pair(labelled_flight: Path) -> None:
+    one, other = positions.judge(labelled_flight)
     assert (one.name, other.name) == ("cf1 sees cf2", "cf2 sees cf1")
     assert one.judged.error_m == pytest.approx(np.tile([0.1, 0.0], (799, 1)))
     assert one.without_truth == 1  # after the last truth
     assert other.judged.error_m == pytest.approx(np.zeros((800, 2)))
     assert np.isnan(other.judged.covariance).all()
-    made = run([labelled], None, Settings())
+    made = run([labelled_flight], None, Settings())
     assert isinstance(made, dict)
     first, second = made["pairs"]
     assert first["rmse_m"] == pytest.approx(0.1)
@@ -66,26 +66,26 @@ def test_positions_are_judged_pair_by_pair(labelled: Path) -> None:
 
 
 @pytest.mark.heavy
-def test_figures_and_plots_are_written(labelled: Path, tmp_path: Path) -> None:
+def test_figures_and_plots_are_written(labelled_flight: Path, tmp_path: Path) -> None:
     out = tmp_path / "judged"
-    made = run([labelled], out, Settings(settle_s=5.0))
+    made = run([labelled_flight], out, Settings(settle_s=5.0))
     assert json.loads((out / "positions.json").read_text()) == made
     names = {path.name for path in out.iterdir()}
     assert {"position-error-cf1-cf2.png", "position-error-cf2-cf1.svg"} <= names
     with pytest.raises(OutputError):
-        run([labelled], out, Settings())
+        run([labelled_flight], out, Settings())
 
 
 @pytest.mark.heavy
 def test_the_table_has_a_row_per_pair_and_one_for_all(
-    labelled: Path, capsys: pytest.CaptureFixture[str]
+    labelled_flight: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    command([labelled])
+    command([labelled_flight])
     text = capsys.readouterr().out
     explained = ("covered:", "95 %:", "wrong:", "NEES:", "in 95 %:", "kept:", "good:", "From 20 s")
     assert all(word in text for word in explained)
     assert [row in text for row in ("cf1 sees cf2", "cf2 sees cf1", "all")] == [True] * 3
-    command([labelled], as_json=True)
+    command([labelled_flight], as_json=True)
     assert json.loads(capsys.readouterr().out)["settle_s"] == 20.0
 
 
@@ -155,9 +155,9 @@ def test_recordings_with_nothing_to_judge_are_refused(tmp_path: Path) -> None:
 
 @pytest.mark.heavy
 def test_a_pipeline_shows_judged_positions(
-    labelled: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    labelled_flight: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    run([labelled], tmp_path / "positions", Settings())
+    run([labelled_flight], tmp_path / "positions", Settings())
     done = [StepOutcome("evaluate", tmp_path / "positions", 1.0, skipped=False)]
     print_report(done)
     assert "cf1 sees cf2" in capsys.readouterr().out

@@ -20,7 +20,7 @@ INT8 = ("onnx-int8", "integer", "c")
 
 
 @pytest.fixture(scope="session")
-def exported(quantised_model: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def exported_model(quantised_model: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return the export of `quantised_model`."""
     out = tmp_path_factory.mktemp("exported") / quantised_model.name
     run(quantised_model, out, Settings())
@@ -43,18 +43,20 @@ def predict_grids(model: Path, recording: Path, out: Path, backend: str) -> np.n
 
 
 def test_every_backend_runs_a_quantised_model_and_an_export(
-    quantised_model: Path, exported: Path, dots: Path, tmp_path: Path
+    quantised_model: Path, exported_model: Path, dots: Path, tmp_path: Path
 ) -> None:
     wanted = predict_grids(quantised_model, dots, tmp_path, "torch")
     assert np.ptp(wanted[:, 0]) > 0.1
-    for model in (quantised_model, exported):
+    for model in (quantised_model, exported_model):
         onnx = predict_grids(model, dots, tmp_path, "onnx")
         np.testing.assert_allclose(onnx, wanted, rtol=1e-3, atol=1e-4)
     reference = predict_grids(quantised_model, dots, tmp_path, "integer")
     assert 0 < np.abs(reference[:, 0] - wanted[:, 0]).mean() < 0.1
-    np.testing.assert_array_equal(predict_grids(exported, dots, tmp_path, "integer"), reference)
-    np.testing.assert_array_equal(predict_grids(exported, dots, tmp_path, "c"), reference)
-    for model in (quantised_model, exported):
+    np.testing.assert_array_equal(
+        predict_grids(exported_model, dots, tmp_path, "integer"), reference
+    )
+    np.testing.assert_array_equal(predict_grids(exported_model, dots, tmp_path, "c"), reference)
+    for model in (quantised_model, exported_model):
         fast = predict_grids(model, dots, tmp_path, "onnx-int8")
         np.testing.assert_allclose(fast, reference, rtol=1e-5)  # equal integer levels
 
@@ -105,9 +107,11 @@ def test_a_float_model_becomes_float_onnx_alone(
     assert len(predict_grids(tmp_path / "export", dots, tmp_path, "onnx")) == 30
 
 
-def test_same_inputs_same_bytes(quantised_model: Path, exported: Path, tmp_path: Path) -> None:
+def test_same_inputs_same_bytes(
+    quantised_model: Path, exported_model: Path, tmp_path: Path
+) -> None:
     run(quantised_model, tmp_path / "again", Settings())
-    for path in exported.iterdir():
+    for path in exported_model.iterdir():
         assert path.read_bytes() == (tmp_path / "again" / path.name).read_bytes(), path.name
 
 
@@ -117,16 +121,16 @@ def test_a_float_model_has_no_int8_backend(random_model: Path, backend: str) -> 
         detector.open_detector(random_model, backend)
 
 
-def test_an_export_is_no_model_for_torch(exported: Path, tmp_path: Path) -> None:
+def test_an_export_is_no_model_for_torch(exported_model: Path, tmp_path: Path) -> None:
     with pytest.raises(ModelError, match="is an export folder, which torch cannot run"):
-        detector.open_detector(exported, "torch")
+        detector.open_detector(exported_model, "torch")
     with pytest.raises(ModelError, match="is an export folder already"):
-        run(exported, tmp_path / "again", Settings())
+        run(exported_model, tmp_path / "again", Settings())
 
 
 @pytest.mark.parametrize("backend", ["onnx", "onnx-int8", "integer"])
-def test_images_of_another_size_are_refused(exported: Path, backend: str) -> None:
-    opened = detector.open_detector(exported, backend)
+def test_images_of_another_size_are_refused(exported_model: Path, backend: str) -> None:
+    opened = detector.open_detector(exported_model, backend)
     with pytest.raises(
         SettingError, match=r"an image: images of 72 x 48 px, .* takes only 64 x 48"
     ):
@@ -150,17 +154,17 @@ def test_missing_model_is_reported(tmp_path: Path, backend: str) -> None:
         detector.open_detector(tmp_path / "nowhere", backend)
 
 
-def test_damaged_description_is_reported(exported: Path, tmp_path: Path) -> None:
+def test_damaged_description_is_reported(exported_model: Path, tmp_path: Path) -> None:
     copy = tmp_path / "copy"
     copy.mkdir()
-    for path in exported.iterdir():
+    for path in exported_model.iterdir():
         (copy / path.name).write_bytes(path.read_bytes())
     (copy / "model.json").write_text("{}")
     with pytest.raises(ModelError, match=r"model.json is damaged"):
         detector.open_detector(copy, "onnx")
 
 
-def test_every_file_of_an_export_is_described(exported: Path) -> None:
-    told = {one.name: one.what for one in list_files(exported)}
+def test_every_file_of_an_export_is_described(exported_model: Path) -> None:
+    told = {one.name: one.what for one in list_files(exported_model)}
     assert len(told) > 10 and [name for name, what in told.items() if not what] == []
     assert told["main.c"] != next(told[n] for n in told if n.endswith("_vectors.h"))

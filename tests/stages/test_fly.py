@@ -24,7 +24,7 @@ SHORT = Settings(duration_s=4.0, seed=3)
 
 
 @pytest.fixture(scope="module")
-def seen(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a flight of three robots over 4 s; the first two carry a camera."""
     out = tmp_path_factory.mktemp("fly") / "seen.mcap"
     fly.run(out, Settings(3, 4.0, noise="harsh", seed=3, camera=True, cameras_max=2))
@@ -32,31 +32,31 @@ def seen(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.heavy
-def test_every_topic_has_its_rate(seen: Path) -> None:
-    counts = {topic: info.count for topic, info in read_summary(seen).topics.items()}
+def test_every_topic_has_its_rate(recording: Path) -> None:
+    counts = {topic: info.count for topic, info in read_summary(recording).topics.items()}
     assert counts["/cf3/attitude"] == counts["/cf3/velocity"] == counts["/cf3/height"] == 401
     assert counts["/cf2/peer/cf3/truth"] == counts["/tf"] == 80
     assert counts["/cf1/camera/image"] == counts["/cf1/labels"] == 20
     assert counts["/cf2/camera/calibration"] == 1
     assert 120 < counts["/cf3/range/cf1"] < 200
     assert "/cf3/camera/image" not in counts
-    assert not [f for f in check(seen) if f.level == "error"]
+    assert not [f for f in check(recording) if f.level == "error"]
 
 
 @pytest.mark.heavy
-def test_measurements_use_the_clock_of_the_robot(seen: Path) -> None:
+def test_measurements_use_the_clock_of_the_robot(recording: Path) -> None:
     flight = simulate(Scenario(3, 4.0), NOISE["harsh"], 3)
-    table = read_table(seen, "/cf2/velocity")
+    table = read_table(recording, "/cf2/velocity")
     assert np.allclose(table.column("vx_mps").to_numpy(), flight.robots["cf2"].vx_mps)
     times = table.column("log_time").to_numpy().astype(float) * 1e-9
     assert np.allclose(times, 1.0 + flight.robots["cf2"].time_s, atol=1e-8)
     assert abs(times[0] - 1.0) > 1e-3  # the clocks of harsh noise have offsets
 
 
-def test_truth_labels_are_projections_of_the_true_positions(seen: Path) -> None:
+def test_truth_labels_are_projections_of_the_true_positions(recording: Path) -> None:
     flight = simulate(Scenario(3, 4.0), NOISE["harsh"], 3)
     camera = AIDECK_PINHOLE
-    for k, stamped in enumerate(read(seen, "/cf1/labels")):
+    for k, stamped in enumerate(read(recording, "/cf1/labels")):
         time_s = np.array([0.1 + 0.2 * k])
         assert stamped.time_ns == 1_000_000_000 + round(time_s[0] * 1e9)
         for label in stamped.message.peers:
@@ -73,8 +73,8 @@ def test_truth_labels_are_projections_of_the_true_positions(seen: Path) -> None:
             assert (label.source, label.status) == ("truth", 0)
 
 
-def test_truth_is_exact_and_in_the_frame_of_the_observer(seen: Path) -> None:
-    stamped = next(read(seen, "/cf2/peer/cf3/truth"))
+def test_truth_is_exact_and_in_the_frame_of_the_observer(recording: Path) -> None:
+    stamped = next(read(recording, "/cf2/peer/cf3/truth"))
     flight = simulate(Scenario(3, 4.0), NOISE["harsh"], 3)
     xyz = flight.peer_in_horizontal("cf2", "cf3", np.zeros(1))[0]
     assert (stamped.message.x, stamped.message.y, stamped.message.z) == pytest.approx(tuple(xyz))
@@ -82,8 +82,8 @@ def test_truth_is_exact_and_in_the_frame_of_the_observer(seen: Path) -> None:
     assert stamped.message.frame_id == "cf2/horizontal"
 
 
-def test_transforms_lead_from_the_world_to_the_lens(seen: Path) -> None:
-    transforms = next(read(seen, "/tf")).message.transforms
+def test_transforms_lead_from_the_world_to_the_lens(recording: Path) -> None:
+    transforms = next(read(recording, "/tf")).message.transforms
     names = [(t.parent_frame_id, t.child_frame_id) for t in transforms][:3]
     assert names == [
         ("world", "cf1/horizontal"),

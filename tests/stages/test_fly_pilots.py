@@ -31,7 +31,7 @@ DRAWN = replace(SHORT, camera=True, camera_renderer="sketch", duration_s=3.0)
 
 
 @pytest.fixture(scope="module")
-def ideal(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def ideal_flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a flight of 4 s with an ideal detector, without images."""
     out = tmp_path_factory.mktemp("ideal") / "flight.mcap"
     fly.run(out, SHORT)
@@ -53,22 +53,22 @@ def read_commands(path: Path, robot: str = "cf1") -> np.ndarray:
     return np.column_stack([table[name].to_numpy() for name in names])
 
 
-def test_specified_topics_have_their_rates(ideal: Path) -> None:
-    counts = {topic: info.count for topic, info in read_summary(ideal).topics.items()}
+def test_specified_topics_have_their_rates(ideal_flight: Path) -> None:
+    counts = {topic: info.count for topic, info in read_summary(ideal_flight).topics.items()}
     assert counts["/cf1/attitude"] == counts["/cf2/velocity"] == counts["/cf1/height"] == 401
     assert counts["/cf1/command"] == counts["/cf1/peer/cf2/truth"] == counts["/tf"] == 81
     assert counts["/cf1/detections"] == counts["/cf1/labels"] == 40
     assert counts["/cf1/tracks"] == 39  # the last image arrives after the end
     assert counts["/cf1/range/cf2"] > 100
-    assert not [f for f in check(ideal) if f.level == "error"]
-    frames = {t.frame_id for t in (s.message for s in read(ideal, "/cf1/tracks"))}
+    assert not [f for f in check(ideal_flight) if f.level == "error"]
+    frames = {t.frame_id for t in (s.message for s in read(ideal_flight, "/cf1/tracks"))}
     assert frames == {"cf1/horizontal"}
 
 
-def test_detections_of_an_ideal_eye_are_the_labels_with_its_errors(ideal: Path) -> None:
+def test_detections_of_an_ideal_eye_are_the_labels_with_its_errors(ideal_flight: Path) -> None:
     pixels, depths = [], []
     for label, found in zip(
-        read(ideal, "/cf1/labels"), read(ideal, "/cf1/detections"), strict=True
+        read(ideal_flight, "/cf1/labels"), read(ideal_flight, "/cf1/detections"), strict=True
     ):
         assert label.time_ns == found.time_ns
         (peer,), (one,) = label.message.peers, found.message.detections
@@ -97,11 +97,11 @@ def test_follower_without_detections_loses_the_leader(tmp_path: Path) -> None:
     assert read_summary(out).topics["/cf1/command"].count == 241
 
 
-def test_flight_bytes_depend_only_on_the_seed(ideal: Path, tmp_path: Path) -> None:
+def test_flight_bytes_depend_only_on_the_seed(ideal_flight: Path, tmp_path: Path) -> None:
     for seed in (2, 3):
         fly.run(tmp_path / f"{seed}.mcap", replace(SHORT, seed=seed))
-    assert (tmp_path / "2.mcap").read_bytes() == ideal.read_bytes()
-    assert not np.allclose(read_commands(tmp_path / "3.mcap"), read_commands(ideal))
+    assert (tmp_path / "2.mcap").read_bytes() == ideal_flight.read_bytes()
+    assert not np.allclose(read_commands(tmp_path / "3.mcap"), read_commands(ideal_flight))
 
 
 def test_flight_is_reproduced_from_its_recorded_recipe(seen: Path, tmp_path: Path) -> None:
@@ -139,8 +139,8 @@ def test_predict_and_track_reproduce_onboard_results(seen: Path, tmp_path: Path)
         assert np.array(one) == pytest.approx(np.array(other), abs=0.02)
 
 
-def test_tracks_are_published_one_image_late(ideal: Path) -> None:
-    for stamped in read_raw(ideal, "/cf1/tracks"):
+def test_tracks_are_published_one_image_late(ideal_flight: Path) -> None:
+    for stamped in read_raw(ideal_flight, "/cf1/tracks"):
         assert stamped.publish_ns - stamped.time_ns == 100_000_000
 
 

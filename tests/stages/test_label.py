@@ -29,7 +29,7 @@ LENIENT = Settings(gate_m=0.5)  # a flight of half a minute is too short for the
 
 
 @pytest.fixture(scope="module")
-def labelled(flight: Path) -> Path:
+def labelled_flight(flight: Path) -> Path:
     """Return the labelled flight."""
     out = flight.with_name("labelled.mcap")
     label.run(flight, out, LENIENT)
@@ -37,29 +37,29 @@ def labelled(flight: Path) -> Path:
 
 
 @pytest.mark.heavy
-def test_everything_else_is_copied_bit_for_bit(flight: Path, labelled: Path) -> None:
+def test_everything_else_is_copied_bit_for_bit(flight: Path, labelled_flight: Path) -> None:
     topics = [t for t in read_summary(flight).topics if t != "/cf1/labels"]
-    assert list(read_raw(labelled, *topics)) == list(read_raw(flight, *topics))
-    assert not [f for f in check(labelled) if f.level == "error"]
+    assert list(read_raw(labelled_flight, *topics)) == list(read_raw(flight, *topics))
+    assert not [f for f in check(labelled_flight) if f.level == "error"]
 
 
 @pytest.mark.heavy
-def test_positions_come_at_20_hz_and_at_every_image(labelled: Path) -> None:
-    there = set(read_table(labelled, "/cf1/peer/cf2/position")["log_time"].to_pylist())
-    images = read_table(labelled, "/cf1/camera/image", fields=())["log_time"].to_pylist()
+def test_positions_come_at_20_hz_and_at_every_image(labelled_flight: Path) -> None:
+    there = set(read_table(labelled_flight, "/cf1/peer/cf2/position")["log_time"].to_pylist())
+    images = read_table(labelled_flight, "/cf1/camera/image", fields=())["log_time"].to_pylist()
     assert set(images) <= there
-    back = read_table(labelled, "/cf2/peer/cf1/position")["log_time"].to_numpy()
+    back = read_table(labelled_flight, "/cf2/peer/cf1/position")["log_time"].to_numpy()
     assert (np.diff(back) == SECOND_NS // 20).all()
-    first = next(read(labelled, "/cf1/peer/cf2/position")).message
+    first = next(read(labelled_flight, "/cf1/peer/cf2/position")).message
     assert first.frame_id == "cf1/horizontal"
     assert len(first.covariance) == 9
 
 
 @pytest.mark.heavy
-def test_positions_are_near_the_truth(labelled: Path) -> None:
+def test_positions_are_near_the_truth(labelled_flight: Path) -> None:
     for one, other in (("cf1", "cf2"), ("cf2", "cf1")):
-        found = read_table(labelled, f"/{one}/peer/{other}/position")
-        truth = read_table(labelled, f"/{one}/peer/{other}/truth")
+        found = read_table(labelled_flight, f"/{one}/peer/{other}/position")
+        truth = read_table(labelled_flight, f"/{one}/peer/{other}/truth")
         time_ns = truth["log_time"].to_numpy()
         errors = [
             found[axis].to_numpy()
@@ -70,9 +70,9 @@ def test_positions_are_near_the_truth(labelled: Path) -> None:
         assert np.abs(errors[2]).mean() < 0.1
 
 
-def test_labels_stand_beside_those_of_other_sources(flight: Path, labelled: Path) -> None:
+def test_labels_stand_beside_those_of_other_sources(flight: Path, labelled_flight: Path) -> None:
     before = {s.time_ns: s.message for s in read(flight, "/cf1/labels")}
-    after = {s.time_ns: s.message for s in read(labelled, "/cf1/labels")}
+    after = {s.time_ns: s.message for s in read(labelled_flight, "/cf1/labels")}
     assert after.keys() == before.keys()
     for time_ns, peers in after.items():
         assert [p for p in peers.peers if p.source == "truth"] == list(before[time_ns].peers)
@@ -81,11 +81,11 @@ def test_labels_stand_beside_those_of_other_sources(flight: Path, labelled: Path
     assert all(p.peer == "cf2" and p.sigma_u_px > 0 and p.sigma_depth_m > 0 for p in ours)
 
 
-def test_labels_are_projections_of_the_positions(labelled: Path) -> None:
-    attitude = read_table(labelled, "/cf1/attitude")
-    positions = {s.time_ns: s.message for s in read(labelled, "/cf1/peer/cf2/position")}
+def test_labels_are_projections_of_the_positions(labelled_flight: Path) -> None:
+    attitude = read_table(labelled_flight, "/cf1/attitude")
+    positions = {s.time_ns: s.message for s in read(labelled_flight, "/cf1/peer/cf2/position")}
     seen = 0
-    for stamped in read(labelled, "/cf1/labels"):
+    for stamped in read(labelled_flight, "/cf1/labels"):
         at = positions[stamped.time_ns]
         roll, pitch = (
             np.interp([stamped.time_ns], attitude["log_time"].to_numpy(), attitude[n].to_numpy())
@@ -114,7 +114,7 @@ def measure_error_px(recording: Path) -> float:
 
 
 @pytest.mark.heavy
-def test_detections_improve_labels(flight: Path, labelled: Path, tmp_path: Path) -> None:
+def test_detections_improve_labels(flight: Path, labelled_flight: Path, tmp_path: Path) -> None:
     seen, rng = tmp_path / "seen.mcap", np.random.default_rng(0)
     with RecordingWriter(seen, Provenance("test")) as sink:
         for stamped in read(flight):
@@ -133,7 +133,7 @@ def test_detections_improve_labels(flight: Path, labelled: Path, tmp_path: Path)
             made = message_class("Detections")(detections=found, threshold=0.33)
             sink.write(stamped.time_ns, topics.DETECTIONS("cf1"), made)
     label.run(seen, tmp_path / "refined.mcap", replace(LENIENT, detections=True))
-    assert measure_error_px(tmp_path / "refined.mcap") < 0.6 * measure_error_px(labelled)
+    assert measure_error_px(tmp_path / "refined.mcap") < 0.6 * measure_error_px(labelled_flight)
     with pytest.raises(
         SettingError, match="--detections goes with --method batch or swarm, not ekf"
     ):
@@ -144,19 +144,21 @@ def test_detections_improve_labels(flight: Path, labelled: Path, tmp_path: Path)
 
 
 @pytest.mark.heavy
-def test_labelling_again_changes_no_position(labelled: Path, tmp_path: Path) -> None:
+def test_labelling_again_changes_no_position(labelled_flight: Path, tmp_path: Path) -> None:
     out = tmp_path / "again.mcap"
-    label.run(labelled, out, LENIENT)
-    assert read_summary(out).topics == read_summary(labelled).topics
+    label.run(labelled_flight, out, LENIENT)
+    assert read_summary(out).topics == read_summary(labelled_flight).topics
     assert [s.message for s in read(out, "/*/peer/*/position", "/cf1/labels")] == [
-        s.message for s in read(labelled, "/*/peer/*/position", "/cf1/labels")
+        s.message for s in read(labelled_flight, "/*/peer/*/position", "/cf1/labels")
     ]
 
 
 @pytest.mark.heavy
-def test_the_same_input_gives_the_same_bytes(flight: Path, labelled: Path, tmp_path: Path) -> None:
+def test_the_same_input_gives_the_same_bytes(
+    flight: Path, labelled_flight: Path, tmp_path: Path
+) -> None:
     label.run(flight, tmp_path / "labelled.mcap", LENIENT)
-    assert (tmp_path / "labelled.mcap").read_bytes() == labelled.read_bytes()
+    assert (tmp_path / "labelled.mcap").read_bytes() == labelled_flight.read_bytes()
 
 
 @pytest.mark.heavy
@@ -194,17 +196,17 @@ def test_robot_without_positions_is_unconverged_in_every_image(
         assert (entry.status, entry.sigma_u_px) == (STATUS_UNCONVERGED, 320)
 
 
-def test_labels_of_empty_images_name_their_source(flight: Path, labelled: Path) -> None:
+def test_labels_of_empty_images_name_their_source(flight: Path, labelled_flight: Path) -> None:
     assert {tuple(s.message.sources) for s in read(flight, "/cf1/labels")} == {("truth",)}
-    looked = [set(s.message.sources) for s in read(labelled, "/cf1/labels")]
+    looked = [set(s.message.sources) for s in read(labelled_flight, "/cf1/labels")]
     assert all("truth" in sources for sources in looked)
     assert sum("estimate" in sources for sources in looked) > 40
 
 
-def test_the_noise_of_heights_is_smoothed_away(labelled: Path) -> None:
+def test_the_noise_of_heights_is_smoothed_away(labelled_flight: Path) -> None:
     """The remaining error is the bias of the height sensors, which is constant during a flight."""
-    found = read_table(labelled, "/cf1/peer/cf2/position")
-    truth = read_table(labelled, "/cf1/peer/cf2/truth")
+    found = read_table(labelled_flight, "/cf1/peer/cf2/position")
+    truth = read_table(labelled_flight, "/cf1/peer/cf2/truth")
     time_ns, truth_ns = found["log_time"].to_numpy(), truth["log_time"].to_numpy()
     off_m = found["z"].to_numpy() - np.interp(time_ns, truth_ns, truth["z"].to_numpy())
     assert off_m.std() < 2**0.5 * NOISE["calibrated"].height_white_m / 3

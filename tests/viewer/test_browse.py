@@ -48,7 +48,7 @@ def folder(pictures: Path) -> Path:
 
 
 @pytest.fixture(scope="module")
-def found(pictures: Path) -> Path:
+def detected_recording(pictures: Path) -> Path:
     """Return detections in the five images with the errors of `OFF_PX`."""
     path = pictures.with_name("found.mcap")
     with RecordingWriter(path, made_by("predict", Settings(), (pictures,))) as sink:
@@ -81,9 +81,9 @@ def read_greys(path: Path) -> list[int]:
 
 @pytest.mark.heavy
 def test_the_worst_row_comes_first_and_those_without_a_peer_last(
-    folder: Path, found: Path, rrd: Path
+    folder: Path, detected_recording: Path, rrd: Path
 ) -> None:
-    assert save([folder, found], rrd, Settings()) == 5
+    assert save([folder, detected_recording], rrd, Settings()) == 5
     assert read_greys(rrd) == [40, 120, 0, 80, 160]
     errors_px = read_column(rrd, "/row/error_px", "Scalars:scalars")
     assert errors_px == [[30.0], [10.0], [3.0], [1.0]]
@@ -109,22 +109,24 @@ def test_a_dataset_alone_is_shown_in_its_order_with_its_own_maps(folder: Path, r
 
 
 @pytest.mark.heavy
-def test_rows_are_filtered_by_error_and_number(folder: Path, found: Path, rrd: Path) -> None:
+def test_rows_are_filtered_by_error_and_number(
+    folder: Path, detected_recording: Path, rrd: Path
+) -> None:
     between = Settings(error_from_px=2.0, error_to_px=20.0)
-    assert save([folder, found], rrd, between) == 2
+    assert save([folder, detected_recording], rrd, between) == 2
     assert read_greys(rrd) == [120, 0]
     rrd.unlink()
-    assert save([folder, found], rrd, Settings(most=1)) == 1
+    assert save([folder, detected_recording], rrd, Settings(most=1)) == 1
     assert read_greys(rrd) == [40]
 
 
 def test_filter_without_matches_reports_the_error_range(
-    folder: Path, found: Path, rrd: Path
+    folder: Path, detected_recording: Path, rrd: Path
 ) -> None:
     with pytest.raises(
         SettingError, match=r"errors are 1\.00 to 30\.00 px. Change --error-from-px"
     ):
-        save([folder, found], rrd, Settings(error_from_px=100.0))
+        save([folder, detected_recording], rrd, Settings(error_from_px=100.0))
     with pytest.raises(SettingError, match=r"name its recording as well"):
         save([folder], rrd, Settings(error_from_px=1.0))
     assert list(rrd.parent.glob("*.rrd*")) == []

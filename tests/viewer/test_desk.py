@@ -18,7 +18,7 @@ pytestmark = [pytest.mark.heavy, pytest.mark.timeout(600)]
 
 
 @pytest.fixture(scope="module")
-def seen(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def desk_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a folder with images, detections of a network, and a dataset."""
     place = tmp_path_factory.mktemp("desk")
     dmrl.sketch(place / "pictures", images=24, seed=4)
@@ -44,14 +44,14 @@ def read_label(browser: Browser, row: int, k: int) -> dict[str, float]:
 @pytest.mark.parametrize("width_px", [1200, 390])
 @pytest.mark.parametrize("what", ["dataset", "recording"])
 def test_edits_on_the_label_desk_reach_the_dataset(
-    seen: Path, tmp_path: Path, width_px: int, what: str
+    desk_folder: Path, tmp_path: Path, width_px: int, what: str
 ) -> None:
     given = ["set", "seen.mcap"] if what == "dataset" else ["seen.mcap"]
     page = tmp_path / "desk.html"
-    words = ["view", *(str(seen / name) for name in given), "--flag", str(page)]
+    words = ["view", *(str(desk_folder / name) for name in given), "--flag", str(page)]
     app(words, result_action="return_value")
     source = "flight.mcap" if what == "dataset" else "seen.mcap"
-    truth = dmrl.open(seen / "flight.mcap")["/cf1/labels"].to_arrow().to_pylist()
+    truth = dmrl.open(desk_folder / "flight.mcap")["/cf1/labels"].to_arrow().to_pylist()
     with open_browser(tmp_path, width_px) as browser:
         browser.open(page)
         assert browser.run("return document.documentElement.scrollWidth <= innerWidth;")
@@ -109,7 +109,7 @@ def test_edits_on_the_label_desk_reach_the_dataset(
     assert sorted(one["log_time"] for one in table) == sorted(int(times[k]) for k in (row, second))
     assert {peer["source"] for one in table for peer in one["peers"]} == {"hand"}
     assert found.provenance is not None and found.provenance.inputs[0].name == source
-    recording = seen / source
+    recording = desk_folder / source
     made = dmrl.make_dataset(
         recording,
         tmp_path / "fixed",
@@ -128,10 +128,10 @@ def test_edits_on_the_label_desk_reach_the_dataset(
 
 @browser_only
 def test_pictures_that_were_never_labelled_become_a_dataset_on_the_desk(
-    seen: Path, tmp_path: Path
+    desk_folder: Path, tmp_path: Path
 ) -> None:
     pictures = tmp_path / "plain.mcap"
-    dmrl.trim(seen / "flight.mcap", pictures, topic=["/cf1/camera/*"])
+    dmrl.trim(desk_folder / "flight.mcap", pictures, topic=["/cf1/camera/*"])
     with pytest.raises(MissingTopic, match="by hand: dmrl view"):
         dmrl.make_dataset(pictures, tmp_path / "none")
     page = tmp_path / "desk.html"
@@ -163,7 +163,7 @@ def test_pictures_that_were_never_labelled_become_a_dataset_on_the_desk(
     assert frame["row"].nunique() == 2
     assert frame["label_source"].dropna().tolist() == ["hand"]
     with pytest.raises(SettingError, match=r"corrects plain.mcap, which is not among"):
-        dmrl.make_dataset(seen / "flight.mcap", tmp_path / "other", corrections=corrections)
+        dmrl.make_dataset(desk_folder / "flight.mcap", tmp_path / "other", corrections=corrections)
 
 
 def find_truth(table: list[dict[str, object]], time_ns: str) -> list[object]:
