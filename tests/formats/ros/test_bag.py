@@ -11,7 +11,7 @@ from dmrl import topics
 from dmrl.errors import SourceError
 from dmrl.formats.base import Options
 from dmrl.formats.registry import find_format
-from dmrl.formats.ros import write_bag as ros
+from dmrl.formats.ros import bag as ros
 from dmrl.images.bayer import demosaic
 from dmrl.images.codec import decode
 from dmrl.samples.sample import Sample
