@@ -1,11 +1,13 @@
-"""Every benchmark that wants no data of others: its table, its JSON, a picture, the machine.
+"""Run every benchmark that needs no external data, and collect its results.
 
-Run as ``python benchmarks/bench_all.py [OUT] [--only recording ...]``; ``make bench`` does. In OUT:
-a .txt of each, .json where it writes one, machine.json and ratios.png: what others take of CPU
-time for what dmrl does, of the same rounds. One that fails, for want of a package or of Blender,
-is told with its last line, the others go on, and the exit status is 1. With ``--model
-crazyflie-published.blend --backgrounds DIR``, which are the authors' and photos, rendering is
-compared with the published way; without, it is timed alone.
+Run as ``python benchmarks/bench_all.py [OUT] [--only recording ...]``, or by ``make bench``. OUT
+gets a .txt file of each benchmark, its .json file if it writes one, machine.json and ratios.png.
+The picture shows the CPU time of other packages relative to that of dmrl for the same work.
+
+If a benchmark fails, for example because a package or Blender is missing, the last line of its
+error is printed, the others still run, and the exit status is 1. With ``--model
+crazyflie-published.blend --backgrounds DIR`` (the authors' model and a folder of photos) rendering
+is compared with the published method. Without them it is only timed.
 """
 
 import argparse
@@ -32,15 +34,15 @@ WORK: Mapping[str, tuple[str, ...]] = {
     "dataset": ("bench_dataset.py",),
     "labels": ("bench_labels.py", "--costs-only"),
 }
-"""Scripts and what they are given; one that ends in ``--json`` is told where to."""
+"""Scripts and their arguments; after a final ``--json`` the output path is added."""
 ASKS = {
-    "deploy": "python benchmarks/bench_deploy.py EXPORT: of a network of one's own",
+    "deploy": "python benchmarks/bench_deploy.py EXPORT needs an exported network",
 }
-"""What is left out, and why."""
+"""Benchmarks that are skipped, and how to run them."""
 
 
-def machine() -> dict[str, Any]:
-    """Where figures are from."""
+def describe_machine() -> dict[str, Any]:
+    """Return platform, Python version, processor, number of cores and load of this machine."""
     info = Path("/proc/cpuinfo")
     lines = info.read_text().splitlines() if info.exists() else []
     names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
@@ -54,7 +56,7 @@ def machine() -> dict[str, Any]:
 
 
 def run(name: str, out: Path, material: list[str]) -> str:
-    """One benchmark; nothing, or the last line of what went wrong."""
+    """Run one benchmark and store its output; return the last line of its error, or ""."""
     script, *words = WORK[name]
     if words and words[-1] == "--json":
         words.append(str(out / f"{name}.json"))
@@ -69,7 +71,7 @@ def run(name: str, out: Path, material: list[str]) -> str:
 
 
 def draw(out: Path) -> None:
-    """Draw the times of others, relative to dmrl's, as bars; missing ones are left out."""
+    """Draw bars of the CPU time of other packages over that of dmrl, from the JSON files there."""
     bars: list[tuple[str, float]] = []
     if (path := out / "recording.json").exists():
         rows = json.loads(path.read_text())
@@ -91,13 +93,13 @@ def draw(out: Path) -> None:
     axes = figure.subplots()
     axes.barh([name for name, _ in bars], [ratio for _, ratio in bars], color="#4477aa")
     axes.axvline(1, color="black", linewidth=1)
-    axes.set(xscale="log", xlabel="CPU time, times what dmrl takes")
+    axes.set(xscale="log", xlabel="CPU time, relative to dmrl")
     axes.invert_yaxis()
     figure.savefig(out / "ratios.png", dpi=120)
 
 
 def main() -> None:
-    """Run all, or those that are named."""
+    """Run all benchmarks, or those given by --only."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("out", type=Path, nargs="?", default=Path("build/bench"))
     parser.add_argument("--only", nargs="+", choices=list(WORK), default=list(WORK))
@@ -107,11 +109,11 @@ def main() -> None:
     given = {"--model": arguments.model, "--backgrounds": arguments.backgrounds}
     material = [w for flag, path in given.items() if path for w in (flag, str(path.resolve()))]
     arguments.out.mkdir(parents=True, exist_ok=True)
-    (arguments.out / "machine.json").write_text(json.dumps(machine(), indent=1) + "\n")
+    (arguments.out / "machine.json").write_text(json.dumps(describe_machine(), indent=1) + "\n")
     failed = {name: why for name in arguments.only if (why := run(name, arguments.out, material))}
     draw(arguments.out)
     for name, why in ASKS.items():
-        print(f"left out: {name}: {why}")
+        print(f"skipped: {name}: {why}")
     for name, why in failed.items():
         print(f"failed: {name}: {why}", file=sys.stderr)
     sys.exit(bool(failed))

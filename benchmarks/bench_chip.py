@@ -1,9 +1,9 @@
-"""The published chip's own maps against our int8 of the same weights.
+"""Compare the maps that the published chip computed with our int8 network of the same weights.
 
 Run as ``python benchmarks/bench_chip.py DATA [--plot STEM]``, where DATA holds
-``aideck-frames`` and ``locanet-weights``. The chip computed two frames with the vendor's int8
-(one scale for all of its output: a step is 0.211 in the logit and in the log depth); our
-network is calibrated on the four frames there are: on their ranges, not on the chip's maps.
+``aideck-frames`` and ``locanet-weights``. The chip processed two frames with the vendor's int8
+network. Its output has a single scale: one step is 0.211 in the logit and in the log depth. Our
+network is calibrated on the activation ranges of all four frames, not on the maps of the chip.
 """
 
 import argparse
@@ -32,15 +32,15 @@ CHANNELS = {"confidence": "pos", "log_depth": "dep"}
 
 @dataclass(frozen=True)
 class Agreement:
-    """How one map agrees with the chip's, in its steps."""
+    """Agreement of one map with that of the chip; differences in steps of the chip's output."""
 
     correlation: float
     mean_steps: float
     most_levels: int
 
 
-def chip_map(file: Path) -> NDArray[np.float64]:
-    """(28, 40) values of a map in the chip's form: P5, one byte a cell, 128 is 0."""
+def read_chip_map(file: Path) -> NDArray[np.float64]:
+    """Return the (28, 40) values of a map of the chip: a P5 file, one byte per cell, 128 is 0."""
     head, size, most, body = file.read_bytes().split(b"\n", 3)
     cols, rows = (int(side) for side in size.split())
     assert (head, int(most)) == (b"P5", 255)
@@ -48,8 +48,8 @@ def chip_map(file: Path) -> NDArray[np.float64]:
     return STEP * levels.reshape(rows, cols)
 
 
-def agreement(chip: NDArray[np.float64], ours: NDArray[np.floating]) -> Agreement:
-    """Correlation, mean difference in steps, and the most levels that a cell is off by."""
+def measure_agreement(chip: NDArray[np.float64], ours: NDArray[np.floating]) -> Agreement:
+    """Return correlation, mean absolute difference, and the largest difference of a cell."""
     levels = np.rint(ours / STEP) - np.rint(chip / STEP)
     return Agreement(
         float(np.corrcoef(chip.ravel(), ours.ravel())[0, 1]),
@@ -58,11 +58,11 @@ def agreement(chip: NDArray[np.float64], ours: NDArray[np.floating]) -> Agreemen
     )
 
 
-def backends(data: Path) -> dict[str, Backend]:
-    """Return the published weights as a float backend and as an int8 one."""
+def build_backends(data: Path) -> dict[str, Backend]:
+    """Return a float and an int8 backend with the published weights."""
     model = load_model(data / "locanet-weights" / "real.h5")
     graph = build_graph(trace_operations(model.network))
-    seen = [image_of(data, name)[None] for name in CALIBRATION]
+    seen = [read_image(data, name)[None] for name in CALIBRATION]
     graph, ranges = equalise_channels(graph, calibrate_ranges(graph, seen))
     moments = measure_moments(graph, (image[0] for image in seen))
     network = model.network
@@ -73,24 +73,24 @@ def backends(data: Path) -> dict[str, Backend]:
     }
 
 
-def image_of(data: Path, name: str) -> NDArray[np.uint8]:
-    """Return a frame of the AI-deck."""
+def read_image(data: Path, name: str) -> NDArray[np.uint8]:
+    """Return an image of the AI-deck."""
     file = data / "aideck-frames" / f"img{name}.ppm"
     return decode(file.read_bytes(), file)
 
 
 def compare(data: Path) -> tuple[dict[tuple[str, str, str], Agreement], list[plots.MapPair]]:
-    """Agreement by frame, channel and backend, and the maps to draw."""
+    """Return the agreement by image, channel and backend, and the maps to draw."""
     found, pictures = {}, []
     for name in JUDGED:
-        image = image_of(data, name)
+        image = read_image(data, name)
         folder = data / "aideck-frames" / "gap8-maps"
-        chip = {c: chip_map(folder / f"{stem}{name}.ppm") for c, stem in CHANNELS.items()}
+        chip = {c: read_chip_map(folder / f"{stem}{name}.ppm") for c, stem in CHANNELS.items()}
         maps = {"chip": _maps({c: values[None] for c, values in chip.items()})}
-        for who, backend in backends(data).items():
+        for who, backend in build_backends(data).items():
             outputs = backend.outputs(image[None])
             for channel, values in chip.items():
-                found[name, channel, who] = agreement(values, outputs[channel][0])
+                found[name, channel, who] = measure_agreement(values, outputs[channel][0])
             maps[who] = _maps(outputs)
         shown = {who: maps[who] for who in ("chip", "int8")}
         pictures.append(plots.MapPair(f"frame {name}", image, shown))
@@ -103,7 +103,7 @@ def _maps(outputs: Outputs) -> tuple[NDArray[np.floating], NDArray[np.floating]]
 
 
 def main() -> None:
-    """Print the table, draw the maps."""
+    """Print the table, and draw the maps with --plot."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("data", type=Path)
     parser.add_argument("--plot", type=Path)

@@ -1,13 +1,14 @@
-"""Many recordings here and on Ray: the speed-up on this machine's cores, and what a task costs.
+"""Measure the speed-up of many recordings on local processes and on Ray, and the cost of a task.
 
     dmrl fly fly_in_view flights/0.mcap --duration-s 8 --seed 0    (and so on: some dozens)
     python benchmarks/bench_cluster.py flights
 
-`dmrl label` of the folder with one process, with one for each core, as Ray tasks on a cluster that
-is begun and ended for it, and on two nodes of a core each that are there already; then `dmrl trim`
-of one small recording many times, which is all overhead. Wall times are of a machine as busy as it
-is: the load is printed. CPU is of this process, which hands the tasks out, and so bounds how many
-tasks a second can be begun, wherever they run.
+The folder is labelled by `dmrl label` in four ways: with one process, with one process per core, as
+Ray tasks on a cluster started for this run, and on a running cluster of two one-core nodes. Then
+`dmrl trim` processes one small recording many times, which is nearly all overhead.
+
+Wall times depend on other load, so the load is printed. CPU time is that of this process, which
+submits the tasks. It limits the tasks per second, wherever they run.
 """
 
 import argparse
@@ -32,8 +33,8 @@ from dmrl.topics import ATTITUDE
 TASKS = 200
 
 
-def spent(work: Callable[[], object]) -> tuple[float, float]:
-    """Seconds by the clock, and of this process's CPU."""
+def measure_time(work: Callable[[], object]) -> tuple[float, float]:
+    """Return the wall time of some work and the CPU time of this process, seconds."""
     begun_s, begun_cpu_s = time.perf_counter(), time.process_time()
     with Path(os.devnull).open("w") as nowhere, redirect_stdout(nowhere), redirect_stderr(nowhere):
         work()
@@ -41,8 +42,8 @@ def spent(work: Callable[[], object]) -> tuple[float, float]:
 
 
 @contextmanager
-def nodes(count: int) -> Iterator[None]:
-    """Start a cluster of one-core nodes on this machine, which ``--on ray`` finds."""
+def start_cluster(count: int) -> Iterator[None]:
+    """Start a Ray cluster of one-core nodes on this machine; ``--on ray`` connects to it."""
     from ray.cluster_utils import Cluster  # noqa: PLC0415 - reads the environment
 
     node = {"num_cpus": 1, "object_store_memory": 80_000_000, "node_ip_address": "127.0.0.1"}
@@ -58,8 +59,8 @@ def nodes(count: int) -> Iterator[None]:
         cluster.shutdown()
 
 
-def labels(flights: Path, out: Path) -> list[tuple[str, float, float]]:
-    """Seconds of labelling all of it, and how many times faster than one process."""
+def time_labelling(flights: Path, out: Path) -> list[tuple[str, float, float]]:
+    """Return the wall time to label the folder in each way, seconds, and the speed-up."""
     ways = {
         "one process": {"workers": 1},
         f"{count_cores()} processes": {"workers": None},
@@ -67,19 +68,19 @@ def labels(flights: Path, out: Path) -> list[tuple[str, float, float]]:
     }
     took = {}
     for name, how in ways.items():
-        took[name] = spent(
+        took[name] = measure_time(
             lambda name=name, how=how: run_over_folder("label", flights, out / name, **how)
         )  # type: ignore[misc,arg-type]
-    with nodes(2):
-        took["Ray, two nodes"] = spent(
+    with start_cluster(2):
+        took["Ray, two nodes"] = measure_time(
             lambda: run_over_folder("label", flights, out / "nodes", workers=None, on="ray")
         )
     first_s = took["one process"][0]
     return [(name, wall_s, first_s / wall_s) for name, (wall_s, _) in took.items()]
 
 
-def overhead(folder: Path, on: str | None) -> tuple[float, float]:
-    """Milliseconds by the clock, and of this process's CPU, for each of many small tasks."""
+def measure_overhead(folder: Path, on: str | None) -> tuple[float, float]:
+    """Return the wall time of a small task and the CPU time of this process, milliseconds."""
     source = folder / "small.mcap"
     if not source.exists():
         with RecordingWriter(source, Provenance("bench")) as sink:
@@ -89,26 +90,27 @@ def overhead(folder: Path, on: str | None) -> tuple[float, float]:
     out.mkdir()
     tasks = build_tasks("trim", "recording", found, out)
     with open_executor(on, None) as crew:
-        crew.submit(tasks[0].line, alone=False).result()  # a process is there
-        wall_s, cpu_s = spent(
+        crew.submit(tasks[0].line, alone=False).result()  # the start of processes is not timed
+        wall_s, cpu_s = measure_time(
             lambda: [one.result() for one in [crew.submit(t.line, alone=False) for t in tasks[1:]]]
         )
     return 1e3 * wall_s / TASKS, 1e3 * cpu_s / TASKS
 
 
 def main() -> None:
-    """Print both tables."""
+    """Print the overhead of a task and the speed-up of labelling."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("flights", type=Path)
     flights = parser.parse_args().flights
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
         load = os.getloadavg()[0]
-        rows = [(f"here, {count_cores()} processes", *overhead(folder, None))]
-        rows.append((f"Ray, {count_cores()} cores", *overhead(folder, "ray")))
-        print_table("a task", ("on", "ms by the clock", "ms of CPU here"), rows)
-        title = f"label of {len(list(flights.glob('*.mcap')))} recordings, load {load:.1f}"
-        print_table(title, ("with", "s", "times faster"), labels(flights, folder))
+        rows = [(f"local, {count_cores()} processes", *measure_overhead(folder, None))]
+        rows.append((f"Ray, {count_cores()} cores", *measure_overhead(folder, "ray")))
+        print_table("a small task", ("executor", "wall time, ms", "CPU time here, ms"), rows)
+        title = f"labelling {len(list(flights.glob('*.mcap')))} recordings, load {load:.1f}"
+        rows = time_labelling(flights, folder)
+        print_table(title, ("executor", "wall time, s", "speed-up"), rows)
 
 
 if __name__ == "__main__":

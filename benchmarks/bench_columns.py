@@ -1,8 +1,8 @@
-"""Small messages to Arrow: dmrl's columns against mcap's iter_decoded_messages, one process.
+"""Compare reading small messages as dmrl's Arrow columns with mcap's iter_decoded_messages.
 
-Run as ``python benchmarks/bench_columns.py [--messages 1000000]``. Prints CPU time a message
-of both (mcap's on a tenth of them) and their ratio, then the peak resident memory of dmrl on a
-recording and on one ten times longer, each in a process of its own.
+Run as ``python benchmarks/bench_columns.py [--messages 1000000]``. Prints the CPU time per message
+of both and their ratio; mcap reads a tenth of the messages. Then prints the peak resident memory
+of dmrl for a recording and for one of a tenth of its length, each in its own process.
 """
 
 import argparse
@@ -32,27 +32,27 @@ def write(path: Path, messages: int) -> None:
             out.write_columns(TOPIC, message_class("Attitude"), k * 10_000_000, fields)
 
 
-def with_dmrl(path: Path) -> int:
-    """Messages decoded to Arrow columns, batch by batch."""
+def read_with_dmrl(path: Path) -> int:
+    """Decode the messages to Arrow columns, batch by batch; return their number."""
     return sum(batch.num_rows for batch in iter_columns(path, TOPIC))
 
 
-def with_mcap(path: Path) -> int:
-    """Messages decoded to Python objects by mcap's own reader."""
+def read_with_mcap(path: Path) -> int:
+    """Decode the messages to Python objects by mcap's own reader; return their number."""
     with path.open("rb") as stream:
         reader = make_reader(stream, decoder_factories=[DecoderFactory()])
         return sum(1 for _ in reader.iter_decoded_messages(topics=[TOPIC]))
 
 
-def cpu_us(read: Callable[[Path], int], path: Path) -> float:
-    """CPU microseconds a message."""
+def measure_cpu_us(read: Callable[[Path], int], path: Path) -> float:
+    """Return the CPU time per message, microseconds."""
     before = time.process_time()
     count = read(path)
     return (time.process_time() - before) / count * 1e6
 
 
-def peak_mb(path: Path) -> float:
-    """Peak resident memory of a fresh process that reads the recording, MB."""
+def measure_peak_mb(path: Path) -> float:
+    """Return the peak resident memory of a fresh process that reads the recording, MB."""
     out = subprocess.run(
         [sys.executable, __file__, "--peak-of", str(path)], check=True, capture_output=True
     )
@@ -60,14 +60,14 @@ def peak_mb(path: Path) -> float:
 
 
 def main() -> None:
-    """Measure and print."""
+    """Print CPU times, their ratio and the peak memory."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--messages", type=int, default=1_000_000)
     parser.add_argument("--peak-of", type=Path)
     arguments = parser.parse_args()
     if arguments.peak_of:
-        with_dmrl(arguments.peak_of)
-        # Not ru_maxrss, which begins with that of the process that started this one.
+        read_with_dmrl(arguments.peak_of)
+        # VmHWM, because ru_maxrss starts at the peak of the parent process.
         status = Path("/proc/self/status").read_text(encoding="utf-8")
         print(int(status.split("VmHWM:")[1].split()[0]) / 1024)
         return
@@ -75,13 +75,14 @@ def main() -> None:
         long, short = Path(folder) / "long.mcap", Path(folder) / "short.mcap"
         write(long, arguments.messages)
         write(short, arguments.messages // 10)
-        ours = [cpu_us(with_dmrl, long) for _ in range(3)]
-        theirs = cpu_us(with_mcap, short)
+        ours = [measure_cpu_us(read_with_dmrl, long) for _ in range(3)]
+        theirs = measure_cpu_us(read_with_mcap, short)
         print(f"{arguments.messages} messages, {long.stat().st_size / 1e6:.1f} MB")
-        print(f"dmrl columns            {sorted(ours)[1]:8.2f} us a message (median of 3)")
-        print(f"mcap decoded messages   {theirs:8.2f} us a message")
+        print(f"dmrl columns            {sorted(ours)[1]:8.2f} us per message (median of 3)")
+        print(f"mcap decoded messages   {theirs:8.2f} us per message")
         print(f"ratio                   {theirs / sorted(ours)[1]:8.1f}")
-        print(f"peak memory, 1/10 as long {peak_mb(short):6.1f} MB, whole {peak_mb(long):6.1f} MB")
+        tenth_mb, whole_mb = measure_peak_mb(short), measure_peak_mb(long)
+        print(f"peak memory: a tenth {tenth_mb:6.1f} MB, all messages {whole_mb:6.1f} MB")
 
 
 if __name__ == "__main__":

@@ -1,9 +1,9 @@
-"""What a command costs before it works: its help; and what a sketch costs.
+"""Measure the CPU time of the help of every command, and of a sketched image.
 
-Run as ``python benchmarks/bench_commands.py [--rounds 3] [--json FILE]``. CPU seconds of a process
-for ``dmrl --help`` and the help of every command, beside Python that imports cyclopts alone; then
-CPU milliseconds of a sketch, 320 x 224: of three robots, and of one at most with its JPEG, as
-``dmrl fly --camera`` makes them. Medians over rounds.
+Run as ``python benchmarks/bench_commands.py [--rounds 3] [--json FILE]``. Prints the CPU seconds of
+``dmrl --help``, of the help of every command, and of Python that only imports cyclopts. Then
+prints the CPU milliseconds of a sketch of three robots, 320 x 224 px, and of a sketch of at most
+one robot with its JPEG, as ``dmrl fly --camera`` makes it. All are medians over the rounds.
 """
 
 import argparse
@@ -18,7 +18,7 @@ from dataclasses import replace
 from pathlib import Path
 from statistics import median
 
-os.environ["OPENBLAS_NUM_THREADS"] = "1"  # threads that wait for each other count as work
+os.environ["OPENBLAS_NUM_THREADS"] = "1"  # threads that spin while waiting count as CPU time
 
 import numpy as np
 
@@ -33,16 +33,16 @@ from dmrl.stages import sketch
 SKETCHES = 40
 
 
-def cpu_s(words: list[str]) -> float:
-    """CPU seconds of a process, its start included."""
+def measure_cpu_s(words: list[str]) -> float:
+    """Return the CPU seconds of a Python process, including its start."""
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     subprocess.run([sys.executable, *words], check=True, stdout=subprocess.DEVNULL)
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
 
 
-def sketch_ms(seed: int) -> float:
-    """CPU milliseconds of a sketch, over several."""
+def measure_sketch_ms(seed: int) -> float:
+    """Return the mean CPU time of a sketch of three robots, milliseconds."""
     camera = replace(AIDECK, distortion=())
     begun = time.process_time()
     for k in range(SKETCHES):
@@ -51,8 +51,8 @@ def sketch_ms(seed: int) -> float:
     return (time.process_time() - begun) / SKETCHES * 1e3
 
 
-def with_jpeg_ms(seed: int) -> float:
-    """CPU milliseconds of a sketch of one robot or none, and its JPEG."""
+def measure_sketch_with_jpeg_ms(seed: int) -> float:
+    """Return the mean CPU time of a sketch of at most one robot and its JPEG, milliseconds."""
     settings = sketch.Settings(seed=seed, robots_max=1)
     begun = time.process_time()
     for k in range(SKETCHES):
@@ -61,24 +61,25 @@ def with_jpeg_ms(seed: int) -> float:
 
 
 def main() -> None:
-    """Measure and print."""
+    """Print every median, and write them as JSON with --json."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()
-    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # as where it is installed
+    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # an installed dmrl has bytecode on disk
     work = {
         "python, import cyclopts": ["-c", "import cyclopts"],
         "--help": ["-m", "dmrl.cli", "--help"],
     }
     work |= {f"{name} --help": ["-m", "dmrl.cli", name, "--help"] for name in COMMANDS}
     for words in work.values():
-        cpu_s(words)
+        measure_cpu_s(words)
     rounds = range(arguments.rounds)
-    found = {name: median(cpu_s(words) for _ in rounds) for name, words in work.items()}
-    sketch_ms(0), with_jpeg_ms(0)  # tables are made
-    found["sketch, ms"] = median(sketch_ms(seed) for seed in rounds)
-    found["sketch of one and JPEG, ms"] = median(with_jpeg_ms(seed) for seed in rounds)
+    found = {name: median(measure_cpu_s(words) for _ in rounds) for name, words in work.items()}
+    measure_sketch_ms(0), measure_sketch_with_jpeg_ms(0)  # the first calls build lookup tables
+    found["sketch, ms"] = median(measure_sketch_ms(seed) for seed in rounds)
+    with_jpeg_ms = median(measure_sketch_with_jpeg_ms(seed) for seed in rounds)
+    found["sketch of one and JPEG, ms"] = with_jpeg_ms
     print(f"{platform.platform()}, Python {platform.python_version()}")
     for name, value in found.items():
         print(f"{name:28} {value:8.3f}")

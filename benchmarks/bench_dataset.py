@@ -1,14 +1,14 @@
-"""Images per cpu-second: building a dataset, and gathering shuffled batches from it into torch.
+"""Measure the images per CPU second when building a dataset, and when loading shuffled batches.
 
     python benchmarks/bench_dataset.py [IMAGES]
 
-Peers, in the same run on the same images: `datasets` with its torch format on its own Array3D
-and Image columns, as `save_to_disk` writes them, and `datasets` on our files. The page cache
-is dropped before the first pass of each. One thread.
+dmrl's loader is compared with `datasets` on the same images in the same run: with its torch format
+on Array3D and Image columns written by `save_to_disk`, and on dmrl's files. All use one thread. The
+files of each leave the page cache before its first pass.
 
-The last table compares first passes with a memory map of the images' bytes, of which each batch is
-read in the order of the file: pairs in turn, both opened beforehand, files of either out of the
-page cache.
+The last table compares first passes with a memory map of the raw images that reads each batch in
+file order. Both are opened before the timing and run in turns, with their files out of the page
+cache.
 """
 
 import gc
@@ -38,7 +38,7 @@ Batches = Callable[[], Iterator[torch.Tensor]]
 
 
 def write_recording(path: Path, count: int) -> None:
-    """Write smooth pictures with noise, as JPEG, one peer each."""
+    """Write JPEG images of a smooth ramp with noise, each with a label of one peer."""
     rng = np.random.default_rng(0)
     ramp = np.linspace(0, 200, WIDTH_PX)[None, :, None]
     with RecordingWriter(path, Provenance("bench")) as sink:
@@ -51,14 +51,14 @@ def write_recording(path: Path, count: int) -> None:
             sink.write(k * 10**8, LABELS("cf1"), message_class("PeerLabels")(peers=[peer]))
 
 
-def order_of(count: int) -> Iterator[np.ndarray]:
-    """Yield shuffled indices, batch by batch."""
+def iter_shuffled_indices(count: int) -> Iterator[np.ndarray]:
+    """Yield shuffled indices, batch by batch; the order is always the same."""
     order = np.random.default_rng(1).permutation(count)
     yield from (order[k : k + BATCH] for k in range(0, count, BATCH))
 
 
 def from_dmrl(split: Split) -> Iterator[torch.Tensor]:
-    """Yield images from the loader of `dmrl train`, which gathers the robots as well."""
+    """Yield images from the loader of `dmrl train`, which also gathers the labels."""
     examples = build_examples(split)
     chosen = epoch_indices(len(examples), seed=1, epoch=0)
     for start in range(0, len(chosen), BATCH):
@@ -66,29 +66,29 @@ def from_dmrl(split: Split) -> Iterator[torch.Tensor]:
 
 
 def from_datasets_bytes(split: datasets.Dataset) -> Iterator[torch.Tensor]:
-    """Our files, opened by `datasets`: bytes to arrays by hand, as the card shows."""
-    for batch in order_of(len(split)):
+    """Yield images of dmrl's files opened by `datasets`, converted as the dataset card shows."""
+    for batch in iter_shuffled_indices(len(split)):
         data = split[batch]["pixels"]
         flat = np.stack([np.frombuffer(item, np.uint8) for item in data])
         yield torch.from_numpy(flat.reshape(-1, HEIGHT_PX, WIDTH_PX, 3))
 
 
 def from_datasets_torch(split: datasets.Dataset, column: str) -> Iterator[torch.Tensor]:
-    """Let `datasets` make the tensors."""
+    """Yield images of a column of `datasets`, which makes the tensors."""
     ready = split.select_columns([column]).with_format("torch", dtype=torch.uint8)
-    for batch in order_of(len(split)):
+    for batch in iter_shuffled_indices(len(split)):
         yield ready[batch][column]
 
 
 def save(split: Split, folder: Path, feature: object) -> None:
-    """Save the same images in a column of `datasets`' own, by its own means."""
+    """Save the images by `datasets` in a column of this feature type."""
     features = datasets.Features({"image": feature})
     images = [image for block in split.pixels for image in block]
     datasets.Dataset.from_dict({"image": images}, features=features).save_to_disk(str(folder))
 
 
 def evict(folder: Path) -> None:
-    """Drop every file of a folder from the page cache, which keeps what is mapped."""
+    """Drop the data files of a folder from the page cache, unless they are mapped."""
     gc.collect()
     for path in (*folder.rglob("*.arrow"), *folder.rglob("*.bytes")):
         with path.open("rb") as stream:
@@ -96,32 +96,31 @@ def evict(folder: Path) -> None:
             os.posix_fadvise(stream.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
 
 
-def content_sum(batches: Iterator[torch.Tensor]) -> int:
-    """Sum of every byte of every batch, whatever the order of the axes."""
+def sum_bytes(batches: Iterator[torch.Tensor]) -> int:
+    """Return the sum of all bytes of all batches, which does not depend on the order of axes."""
     return sum(int(batch.sum(dtype=torch.int64)) for batch in batches)
 
 
 def read_mb() -> float:
-    """MB that this process has read from disk so far; Linux counts them."""
+    """Return how much this process has read from disk so far, MB (Linux only)."""
     lines = Path("/proc/self/io").read_text(encoding="utf-8").splitlines()
     return int(next(one for one in lines if one.startswith("read_bytes")).split()[1]) / 1e6
 
 
-def rates(folder: Path, open_way: Callable[[], Batches]) -> tuple[int, int, str]:
-    """Images per cpu-second of a pass from disk and of the pass after it, over `PASSES` openings.
+def measure_rates(folder: Path, open_loader: Callable[[], Batches]) -> tuple[int, int, str]:
+    """Return the images per CPU second of a pass from disk, and of the pass after it.
 
-    The last value is what an opening reads from disk, MB.
-
-    The files leave the page cache before each opening. Without that the first pass looks two to
-    five times as fast, depending on how the files came into the cache: freshly written ones
-    are mapped in larger pieces than those that were copied or read back.
+    The last value is how much opening the images reads from disk, MB. Everything is repeated
+    `PASSES` times. The files leave the page cache before each opening: otherwise the first pass
+    looks two to five times as fast. The factor depends on how the files entered the cache, since
+    freshly written files are mapped in larger pieces than copied ones.
     """
     spent, images, opened_mb = np.zeros(2), np.zeros(2, int), []
     for _ in range(PASSES):
-        batches = None  # or the map of the round before keeps its pages
+        batches = None  # else the memory map of the last round would keep its pages in the cache
         evict(folder)
         before_mb = read_mb()
-        batches = open_way()
+        batches = open_loader()
         opened_mb.append(read_mb() - before_mb)
         for later in (0, 1):
             start = time.process_time()
@@ -132,18 +131,18 @@ def rates(folder: Path, open_way: Callable[[], Batches]) -> tuple[int, int, str]
 
 
 def build(folder: Path, count: int) -> None:
-    """Time `dmrl dataset`, card and hashing of the inputs included."""
+    """Time `dmrl dataset`, including its card and the hashes of its inputs."""
     built = []
     for way in ("raw", "png"):
         start = time.process_time()
         settings = Settings(split="none", png=way == "png")
         run([folder / "flight.mcap"], folder / way, settings)
         built.append((f"dmrl dataset, {way}", round(count / (time.process_time() - start))))
-    print_table("build", ("way", "images per cpu-second"), built)
+    print_table("building", ("command", "images per cpu-second"), built)
 
 
-def ways_of(folder: Path) -> dict[str, Callable[[], Batches]]:
-    """Return a function for each loader that opens the images again."""
+def build_loaders(folder: Path) -> dict[str, Callable[[], Batches]]:
+    """Return a function for each loader that opens the images and returns their batches."""
     raw = str(folder / "raw")
     pixels = open_dataset(folder / "raw").split("train")
     shape = (HEIGHT_PX, WIDTH_PX, 3)
@@ -170,31 +169,35 @@ def ways_of(folder: Path) -> dict[str, Callable[[], Batches]]:
     }
 
 
-def sorted_map(path: Path, count: int) -> Iterator[torch.Tensor]:
-    """Yield shuffled batches of a file of raw images, each read in the order of the file."""
+def iter_memory_map(path: Path, count: int) -> Iterator[torch.Tensor]:
+    """Yield shuffled batches of a file of raw images; each batch is read in file order.
+
+    The first item is empty: it tells that the file is open.
+    """
     images = np.memmap(path, np.uint8, "r", shape=(count, HEIGHT_PX, WIDTH_PX, 3))
     yield torch.empty(0)
-    for batch in order_of(count):
+    for batch in iter_shuffled_indices(count):
         out = np.empty((len(batch), HEIGHT_PX, WIDTH_PX, 3), np.uint8)
         for place in np.argsort(batch):
             out[place] = images[batch[place]]
         yield torch.from_numpy(out)
 
 
-def opened_dmrl(folder: Path) -> Iterator[torch.Tensor]:
-    """Yield nothing once the dataset is open, then the batches of `from_dmrl`."""
+def iter_opened_dmrl(folder: Path) -> Iterator[torch.Tensor]:
+    """Yield an empty tensor once the dataset is open, then the batches of `from_dmrl`."""
     split = open_dataset(folder / "raw").split("train")
     yield torch.empty(0)
     yield from from_dmrl(split)
 
 
 def compare_cold(folder: Path, count: int) -> None:
-    """Print CPU and wall time of first passes over a sorted map's, and what they read."""
-    with (folder / "flat.bytes").open("wb") as flat:
+    """Print the CPU and wall time of a memory map's first pass over dmrl's, and the MB read."""
+    flat_bytes = folder / "flat.bytes"
+    with flat_bytes.open("wb") as flat:
         for batch in from_dmrl(open_dataset(folder / "raw").split("train")):
             flat.write(batch.numpy().tobytes())
-    loaders = [lambda: opened_dmrl(folder), lambda: sorted_map(folder / "flat.bytes", count)]
-    spent = np.zeros((PAIRS + 1, 2, 3))  # CPU-s, s, MB
+    loaders = [lambda: iter_opened_dmrl(folder), lambda: iter_memory_map(flat_bytes, count)]
+    spent = np.zeros((PAIRS + 1, 2, 3))  # CPU time, s; wall time, s; MB read
     for turn in range(PAIRS + 1):
         for which in (0, 1) if turn % 2 else (1, 0):
             evict(folder)
@@ -205,14 +208,14 @@ def compare_cold(folder: Path, count: int) -> None:
                 batch.sum(dtype=torch.int64)
             spent[turn, which] = time.process_time(), time.perf_counter(), read_mb()
             spent[turn, which] -= before
-    ratios = spent[1:, 1, :2] / spent[1:, 0, :2]  # the first pair warms up
+    ratios = spent[1:, 1, :2] / spent[1:, 0, :2]  # the first pair is a warm-up
     rows = [
         (name, *(f"{value:.2f}" for value in (np.median(r), r.min(), r.max())))
         for name, r in zip(("CPU time", "wall time"), ratios.T, strict=True)
     ]
     mb = " and ".join(f"{each:.0f}" for each in np.median(spent[1:, :, 2], axis=0))
-    title = f"rate from disk over that of a sorted map, {PAIRS} pairs; {mb} MB read"
-    print_table(title, ("by", "median", "least", "most"), rows)
+    title = f"rate from disk over that of a memory map, {PAIRS} pairs; {mb} MB read"
+    print_table(title, ("measured by", "median", "min", "max"), rows)
 
 
 def main() -> None:
@@ -224,14 +227,14 @@ def main() -> None:
         folder = Path(name)
         write_recording(folder / "flight.mcap", count)
         build(folder, count)
-        ways = ways_of(folder)
-        # Also brings lazy imports and the page cache to where they are in a long run.
-        sums = {way: content_sum(open_way()()) for way, open_way in ways.items()}
+        loaders = build_loaders(folder)
+        # This pass also does the lazy imports, which would slow the first timed pass.
+        sums = {name: sum_bytes(open_loader()()) for name, open_loader in loaders.items()}
         if len(set(sums.values())) != 1:
-            raise SystemExit(f"the ways gave different images: {sums}")
-        rows = [(way, *rates(folder, open_way)) for way, open_way in ways.items()]
-        title = "load, images per cpu-second; every way gave the same bytes"
-        print_table(title, ("way", "from disk", "pass after it", "MB read to open"), rows)
+            raise SystemExit(f"the loaders gave different images: {sums}")
+        rows = [(name, *measure_rates(folder, one)) for name, one in loaders.items()]
+        title = "loading, images per cpu-second; all loaders gave the same bytes"
+        print_table(title, ("loader", "from disk", "second pass", "MB read to open"), rows)
         compare_cold(folder, count)
 
 

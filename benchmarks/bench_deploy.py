@@ -1,8 +1,8 @@
-"""One image on this computer: the C of an export against onnxruntime, int8 both, one thread.
+"""Compare the exported C with onnxruntime on this computer, one thread each.
 
-Run as ``python benchmarks/bench_deploy.py EXPORT_DIR [--rounds 30]`` on what ``dmrl export``
-wrote. Every round runs each way once, so that all see the same machine; prints the median CPU
-time of an image, the least, and the ratio of medians to onnxruntime int8.
+Run as ``python benchmarks/bench_deploy.py EXPORT_DIR [--rounds 30]`` on the output of ``dmrl
+export``. Every round runs each backend once, so that other load slows all of them alike. Prints the
+median and minimum CPU time of an image, and the ratio of the median to onnxruntime int8.
 """
 
 import argparse
@@ -23,8 +23,8 @@ from dmrl.deploy.samples import load_samples
 PEER = "onnxruntime int8"
 
 
-def ways(folder: Path) -> dict[str, Callable[[], object]]:
-    """Return functions that run one image, by name."""
+def build_runs(folder: Path) -> dict[str, Callable[[], object]]:
+    """Return a function for each backend that runs one image, by name."""
     network, image = load_network(folder), load_samples(folder)[0]
     seen = to_network_input(network, image)
     out: dict[str, Callable[[], object]] = {}
@@ -39,12 +39,12 @@ def ways(folder: Path) -> dict[str, Callable[[], object]]:
 
 
 def main() -> None:
-    """Print a line for each way."""
+    """Print a line for each backend."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--rounds", type=int, default=30)
     args = parser.parse_args()
-    runs = ways(args.folder)
+    runs = build_runs(args.folder)
     times: dict[str, list[float]] = {name: [] for name in runs}
     for _ in range(args.rounds):
         for name, run in runs.items():
@@ -55,7 +55,7 @@ def main() -> None:
     for name, spent in times.items():
         middle = statistics.median(spent)
         print(
-            f"{name:28} {middle:7.2f} ms CPU an image, least {np.min(spent):.2f}, "
+            f"{name:28} {middle:7.2f} ms CPU per image, minimum {np.min(spent):.2f}, "
             f"{middle / peer:.2f} x {PEER}"
         )
 

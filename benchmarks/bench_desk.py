@@ -1,18 +1,19 @@
-"""Plant bad labels in a dataset; measure what the label desk finds of them, and what that gains.
+"""Plant bad labels in a dataset, and measure how many the label desk finds and what that gains.
 
 python benchmarks/bench_desk.py OUT [--seed 1] [--images 1000] [--planted 50] [--first 60]
     [--views 1] [--min-confidence 0.01] [--epochs 0] [--held 500]
 
-1,000 drawings of `dmrl sketch`; in 50 of them the label of one robot is moved by 15 to 60 px. The
-detections of dmrl-nano order the desk. Prints how many planted images are among the first 60, by
-suspicion and by error, how many of these the accepted detections correct, and beside how many true
-places no detection lies: there the network sees nothing, and only the label speaks against itself.
+`dmrl sketch` draws 1,000 images. In 50 of them the label of one robot is moved by 15 to 60 px. The
+detections of dmrl-nano determine the order of images on the desk. Prints how many planted images
+are among the first 60, ordered by suspicion and by error. Of these, prints how many are corrected
+by accepting the detection, and how many true positions have no detection nearby: there the
+network misses the robot, and only the label itself can look suspicious.
 
-Then somebody who knows the truth corrects what is planted among the first 60. The corrections are
-a recording as the page saves it, and `dmrl dataset` takes them. Prints the average precision of
-dmrl-nano on the same images, against the labels of the dataset before and after. With epochs, also
-that of dmrl-nano and of networks refined on both datasets by the recipe own_camera, on 500 other
-drawings with right labels; an epoch of both takes a minute of one core.
+Then the planted labels among the first 60 images are corrected with the truth, in a recording like
+that saved by the page, which `dmrl dataset` reads. Prints the average precision of dmrl-nano on the
+same images, against the labels of the dataset before and after. With --epochs, also trains a
+network on both datasets by the recipe own_camera, and prints its average precision and that of
+dmrl-nano on 500 other drawings with correct labels. An epoch of both takes a minute of one core.
 """
 
 import argparse
@@ -34,9 +35,9 @@ from dmrl.viewer.label_suspicion import NEAR_PX
 
 Row = dict[str, Any]
 UNKNOWN = {"sigma_u_px": 0.0, "sigma_v_px": 0.0, "box_px": [], "status": STATUS_OK}
-"""Fields of a label that somebody moved on the page."""
+"""Fields of a label that was moved on the page."""
 HELD_SEED = 1000
-"""Added to the seed: the seed of the drawings with right labels."""
+"""Added to the seed for the drawings with correct labels."""
 
 
 class Moved(NamedTuple):
@@ -47,7 +48,7 @@ class Moved(NamedTuple):
 
 
 def plant(pictures: Path, count: int, seed: int) -> dict[str, Moved]:
-    """Move a label of some images; return the moved ones by file name."""
+    """Move one label in each of some images; return the moved labels by file name."""
     rng = np.random.default_rng(seed)
     rows = _read_labels(pictures)
     inside = [
@@ -128,7 +129,7 @@ def _parse_arguments() -> argparse.Namespace:
 
 
 def _read_page(page: Path, pictures: Path) -> dict[str, Any]:
-    """Return what the page holds, its rows with the names of their pictures."""
+    """Return the data of the page; the file name of its image is added to each row."""
     text = page.read_text(encoding="utf-8")
     (data,) = re.findall(r'<script type="application/json" id="data">(.*?)</script>', text)
     desk: dict[str, Any] = json.loads(data)
@@ -140,7 +141,7 @@ def _read_page(page: Path, pictures: Path) -> dict[str, Any]:
 
 
 def count_found(desk: dict[str, Any], moved: dict[str, Moved], first: int) -> dict[str, int]:
-    """Count the planted images among the first, and those that detections correct."""
+    """Count the planted images among the first, and those that accepting a detection corrects."""
     bad = [row for row in desk["rows"] if row["file"] in moved]
     shown = [row for row in _list_first(desk, first) if row["file"] in moved]
     by_error = _list_first(desk, first, "error_px")
@@ -167,7 +168,7 @@ def _is_seen(row: Row, moved: dict[str, Moved], least: float) -> bool:
 
 
 def correct(desk: dict[str, Any], moved: dict[str, Moved], first: int, out: Path) -> None:
-    """Put the moved labels of the first rows in their places, in a recording as the page's."""
+    """Write a recording like the page's that moves the planted labels of the first rows back."""
     (source,) = desk["provenance"]
     rows = [row for row in _list_first(desk, first) if row["file"] in moved]
     made = Provenance("desk", {"page": "before"}, inputs=(Input(source, ""),))
@@ -182,7 +183,7 @@ def correct(desk: dict[str, Any], moved: dict[str, Moved], first: int, out: Path
 
 
 def measure_labels(out: Path, name: str) -> float:
-    """Return the AP at 16 px of dmrl-nano against the labels of a dataset, as `evaluate` has it."""
+    """Return the average precision at 16 px of dmrl-nano against the labels of a dataset."""
     files = list(dict.fromkeys(row["file"] for row in _read_labels(out / "pictures")))
     table = dmrl.dataset(out / name)["train"].to_pandas()
     times = sorted(table["log_time"].unique())
@@ -199,7 +200,7 @@ def measure_labels(out: Path, name: str) -> float:
 
 
 def measure_network(model: Path, out: Path) -> float:
-    """Return the AP at 16 px of a network on the drawings with right labels."""
+    """Return the average precision at 16 px of a network on the drawings with correct labels."""
     seen = out / f"held-{model.name}.mcap"
     dmrl.predict(model, out / "held.mcap", seen)
     return _read_precision(seen)

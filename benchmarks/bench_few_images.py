@@ -1,11 +1,12 @@
-"""What a network learns of a new robot and a new lens from 10, 25, 50 and 2,000 labelled images.
+"""Train on 10, 25, 50 and 2,000 labelled images of a new robot and a new lens; compare recall.
 
     python benchmarks/bench_few_images.py FOLDER [--seeds 3] [--init dmrl-nano]
 
-The robot is a grey hexacopter, 0.35 m wide, and the lens has a focal length of 230 px and a barrel
-distortion. The places are Blender's panoramas. Three are those of the user: training images are of
-these, or of the first alone. Every network is judged in the same three places in other directions,
-with other poses and light, and in the other panoramas. FOLDER keeps what is made.
+The robot is a grey hexacopter, 0.35 m wide. The lens has a focal length of 230 px and barrel
+distortion. The places are Blender's panoramas. Three of them are the user's: the training images
+show these three, or only the first. Every network is evaluated in the same three places, with other
+viewing directions, poses and light, and in the remaining panoramas. FOLDER keeps all recordings,
+datasets and models; a later run reuses them.
 """
 
 import argparse
@@ -25,7 +26,7 @@ from dmrl.terminal.tables import print_table
 CAMERA = Camera(320, 224, 230.0, 230.0, 157.0, 115.0, (-0.18, 0.03, 0.0, 0.0, 0.0))
 PLACES, JUDGED = ("courtyard", "interior", "city"), 300
 SETS = (("10", 3, 10), ("25", 3, 25), ("50", 3, 50), ("50 of one place", 1, 50), ("2000", 3, 2000))
-"""Titles, places and images of the training sets."""
+"""Title, number of places and number of images of each training set."""
 
 
 def write_boxes(path: Path) -> None:
@@ -51,7 +52,7 @@ def write_boxes(path: Path) -> None:
 
 
 def link_panoramas(folder: Path) -> dict[str, Path]:
-    """Link Blender's panoramas in folders: the first place, all of the user, and the others."""
+    """Link Blender's panoramas in three folders: the first place, all three, and the others."""
     every = {path.stem: path for path in list_shipped_panoramas(ensure_environment(say))}
     others = tuple(sorted(every.keys() - set(PLACES)))
     groups = {"place": PLACES[:1], "places": PLACES, "others": others}
@@ -64,7 +65,7 @@ def link_panoramas(folder: Path) -> dict[str, Path]:
 
 
 def render(out: Path, lights: Path, images: int, seed: int) -> Path:
-    """Render the robot in the panoramas of a folder, unless it is done."""
+    """Render the robot in the panoramas of a folder, unless the recording exists."""
     robot, camera = out.parent / "hexacopter.obj", out.parent / "camera.toml"
     write_boxes(robot)
     camera.write_text(format_camera(CAMERA), encoding="utf-8")
@@ -80,7 +81,7 @@ def render(out: Path, lights: Path, images: int, seed: int) -> Path:
 def train(
     folder: Path, panoramas: dict[str, Path], init: str, seed: int
 ) -> Iterator[tuple[str, Path]]:
-    """Yield the title and the model of each training set."""
+    """Train on each set, unless its model exists; yield titles and models."""
     for title, places, images in SETS:
         name = f"{images}-of-{places}-{seed}"
         own = render(
@@ -131,8 +132,9 @@ def main() -> None:
         for title, shares in found.items()
         for spread in ((np.mean(shares, axis=0), np.std(shares, axis=0)),)
     ]
-    headers = ["images", "the same places", "other places"]
-    print_table(f"within 20 px, mean and spread of {given.seeds} seeds", headers, rows)
+    headers = ["training images", "the same places", "other places"]
+    title = f"robots found within 20 px, mean and standard deviation of {given.seeds} seeds"
+    print_table(title, headers, rows)
 
 
 if __name__ == "__main__":

@@ -1,13 +1,13 @@
-"""How CPU time and memory of each command grow with the length of a recording.
+"""Measure how CPU time and memory of each command grow with the length of a recording.
 
     python benchmarks/bench_growth.py [--seconds 20] [--times 1 10 100] [--only label ...]
         [--json FILE] [--plot FILE.png]
 
-Flights of two robots with a camera, each some times as long as the first. Each command is a process
-of its own with one thread; its memory is the most that it ever held (the maximum resident set, as
-the system counts it). `fly` makes the flights, `predict` finds robots by `dmrl-nano`, `read` takes
-every topic from `dmrl.open` as an Arrow table. With three lengths or more the exponent of the CPU
-time is fitted: of what it takes beyond the start, which does not depend on the length.
+The flights have two robots with a camera; their lengths are multiples of the shortest. Each command
+runs in its own process with one thread. Its memory is the maximum resident set size. `fly` makes
+the flights, `predict` runs `dmrl-nano`, and `read` reads every topic from `dmrl.open` as an Arrow
+table. With three lengths or more, the exponent of the CPU time is fitted, without the constant time
+of the start.
 """
 
 import argparse
@@ -41,7 +41,7 @@ WORK: Mapping[str, tuple[str, ...]] = {
     "convert to csv": ("convert", "flight.mcap", "csv", "--to", "csv"),
     "view": ("view", "flight.mcap", "--save", "flight.rrd"),
 }
-"""What is run, in this order: later ones read what earlier ones wrote."""
+"""Commands in the order in which they run: later ones read the output of earlier ones."""
 
 
 def run(words: Sequence[str], folder: Path) -> tuple[float, float]:

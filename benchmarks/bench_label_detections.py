@@ -1,10 +1,11 @@
-"""Labels with what cameras saw in the solve: what a network adds to ranges, and takes.
+"""Compare labels from ranges alone with labels from ranges and camera detections.
 
 Run as ``python benchmarks/bench_label_detections.py [--flights 6] [--first-seed 0] [--only CASE]``.
-Flights as `dmrl fly` makes them, and a detector like a small network: 10 images a second of every
-robot; what is in view is missed in 15 %, off by 1.5 px and 10 % of its distance, and 7 % of the
-images show something that is not there; nobody knows which robot was seen. Every pair is solved
-without and with the detections, through `dmrl label`'s gate.
+The flights are simulated like those of `dmrl fly`. Every robot has a detector like a small network,
+with 10 images per second. It misses 15 % of the peers in view. Its noise is 1.5 px and 10 % of the
+distance, 7 % of the images have a false detection, and detections do not name the robot. Every
+pair is solved without and with the detections. The gate of `dmrl label` decides which positions
+are kept.
 """
 
 import argparse
@@ -16,7 +17,7 @@ from itertools import combinations
 from pathlib import Path
 
 import numpy as np
-from bench_label_faults import pair_of, times
+from bench_label_faults import build_pair, list_times
 from fault_cases import CASES as FAULTS
 
 from dmrl.estimation.flight.data_association import resolve_conflicts
@@ -38,23 +39,23 @@ from dmrl.labelling.observer_log import ObserverLog
 IMAGES_HZ = 10.0
 PIXEL_STD_PX, DISTANCE_RATIO, MISSED, FARTHEST_M = 1.5, 0.1, 0.15, 5.0
 SAID_PX, ATTITUDE_STD_RAD = 3.0, 0.015
-"""What `dmrl label` is told of it with --pixel-std-px, and believes of attitudes."""
+"""The --pixel-std-px given to `dmrl label`, and its standard deviation of attitudes."""
 SETTLE_S = 5.0
 Names = tuple[str, str]
 
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """What is flown.
+    """A kind of flight.
 
     Parameters
     ----------
     trajectory, duration_s, robots
         As in `dmrl fly`.
     fault
-        A row of the faults' table.
+        Name of a case in `fault_cases`.
     wrong
-        Share of images with a detection of nothing.
+        Share of images with a false detection.
     """
 
     trajectory: Trajectory
@@ -80,13 +81,13 @@ CASES = {
 }
 
 
-def sights(flight: Flight, wrong: float, seed: int) -> dict[str, ObserverLog]:
-    """Return the detections in the images of every robot's camera."""
+def simulate_detections(flight: Flight, wrong: float, seed: int) -> dict[str, ObserverLog]:
+    """Return simulated detections of every robot's camera."""
     rng = np.random.default_rng(seed + 10_000)
-    return {robot: _sight(flight, robot, wrong, rng) for robot in flight.robots}
+    return {robot: _detect(flight, robot, wrong, rng) for robot in flight.robots}
 
 
-def _sight(flight: Flight, robot: str, wrong: float, rng: np.random.Generator) -> ObserverLog:
+def _detect(flight: Flight, robot: str, wrong: float, rng: np.random.Generator) -> ObserverLog:
     log, truth, clock = flight.robots[robot], flight.truth[robot], flight.clocks[robot]
     time_s = np.arange(log.time_s[0] + 0.05, log.time_s[-1], 1 / IMAGES_HZ)
     true_s = clock.to_true_time(time_s)
@@ -117,24 +118,24 @@ def _sight(flight: Flight, robot: str, wrong: float, rng: np.random.Generator) -
     )
 
 
-def ranges_alone(pairs: dict[Names, Pair], _: dict[str, ObserverLog]) -> dict[Names, Estimate]:
-    """Every ordered pair, from ranges and odometry."""
-    return _both(pairs)
+def solve_without(pairs: dict[Names, Pair], _: dict[str, ObserverLog]) -> dict[Names, Estimate]:
+    """Solve the pairs from ranges and odometry; return every ordered pair."""
+    return _solve_both(pairs)
 
 
-def one_solve(pairs: dict[Names, Pair], seen: dict[str, ObserverLog]) -> dict[Names, Estimate]:
-    """Solve the pairs with detections."""
+def solve_with(pairs: dict[Names, Pair], seen: dict[str, ObserverLog]) -> dict[Names, Estimate]:
+    """Solve the pairs with detections; return every ordered pair."""
     found = {
         robot: detections_to_bearings(sight, 0, SAID_PX, ATTITUDE_STD_RAD)
         for robot, sight in seen.items()
     }
     looking = add_bearings(pairs, found)
-    estimates = _both(looking)
+    estimates = _solve_both(looking)
     again = resolve_conflicts(looking, estimates)
-    return estimates | _both(again) if again else estimates
+    return estimates | _solve_both(again) if again else estimates
 
 
-def _both(pairs: dict[Names, Pair]) -> dict[Names, Estimate]:
+def _solve_both(pairs: dict[Names, Pair]) -> dict[Names, Estimate]:
     out: dict[Names, Estimate] = {}
     for (one, other), (here, there) in zip(
         pairs, estimate_pairs(list(pairs.values())), strict=True
@@ -144,27 +145,28 @@ def _both(pairs: dict[Names, Pair]) -> dict[Names, Estimate]:
 
 
 WAYS: dict[str, Callable[[dict[Names, Pair], dict[str, ObserverLog]], dict[Names, Estimate]]] = {
-    "without": ranges_alone,
-    "with": one_solve,
+    "without": solve_without,
+    "with": solve_with,
 }
 
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """A case solved one way, the peers as cf1 sees them; shares of samples over all flights.
+    """Figures of a case and a method, for the peers of cf1; shares are over samples of all flights.
 
     Parameters
     ----------
     case, way
-        What was flown, and how it was solved.
+        Name of the case, and whether detections are used.
     rmse_m, worst_m
-        Horizontal, after 5 s: median and worst of the flights and peers.
+        Horizontal RMSE after 5 s: median and maximum over flights and peers.
     ellipse
-        Share inside the 95 % ellipse.
+        Share of samples inside the 95 % ellipse, after 5 s.
     kept, bad, worst_bad
-        Share with status OK; of these over 0.3 m off, and in the worst flight.
+        Share with status OK; share of these with an error over 0.3 m, and that share in the worst
+        flight.
     cpu_s
-        CPU seconds of a flight.
+        CPU seconds per flight.
     """
 
     case: str
@@ -184,31 +186,31 @@ class Row:
         )
 
 
-def rows_of(name: str, noise: str, seeds: range) -> Iterator[Row]:
-    """Yield a row for each way to solve a case."""
+def measure_case(name: str, noise: str, seeds: range) -> Iterator[Row]:
+    """Simulate the flights of a case; yield a row for each method."""
     case = CASES[name]
     scenario = Scenario(case.robots, case.duration_s, case.trajectory)
     flights = [simulate(scenario, NOISE[noise], seed, FAULTS[case.fault].faults) for seed in seeds]
     pairs = [
-        {both: pair_of(flight, *both) for both in combinations(flight.robots, 2)}
+        {both: build_pair(flight, *both) for both in combinations(flight.robots, 2)}
         for flight in flights
     ]
-    seen = [sights(f, case.wrong, seed) for f, seed in zip(flights, seeds, strict=True)]
+    seen = [simulate_detections(f, case.wrong, k) for f, k in zip(flights, seeds, strict=True)]
     for way, solve in WAYS.items():
         begun = time.process_time()
         found = [solve(*given) for given in zip(pairs, seen, strict=True)]
         spent_s = (time.process_time() - begun) / len(flights)
-        flown = [list(_judged(*one)) for one in zip(flights, pairs, found, strict=True)]
+        flown = [list(_evaluate(*one)) for one in zip(flights, pairs, found, strict=True)]
         yield _row(name, way, flown, spent_s)
 
 
-def _judged(
+def _evaluate(
     flight: Flight, pairs: dict[Names, Pair], found: dict[Names, Estimate]
 ) -> Iterator[EvaluatedPositions]:
     for (robot, peer), pair in pairs.items():
         if robot != "cf1":
             continue
-        time_s = times(pair)
+        time_s = list_times(pair)
         xy, spread, status = found[robot, peer].interpolate_at(time_s)
         true_s = flight.clocks[robot].to_true_time(time_s)
         truth = flight.peer_in_horizontal(robot, peer, true_s)[:, :2]
@@ -251,17 +253,17 @@ def main() -> None:
     parser.add_argument("--first-seed", type=int, default=0)
     parser.add_argument("--noise", choices=[n for n in NOISE if n != "ideal"], default="calibrated")
     parser.add_argument("--only", choices=list(CASES), action="append", help="may be repeated")
-    parser.add_argument("--json", type=Path, help="write the rows there too")
+    parser.add_argument("--json", type=Path, help="also write the rows to this file")
     given = parser.parse_args()
     seeds = range(given.first_seed, given.first_seed + given.flights)
-    print(f"{given.noise} noise, {given.flights} flights each, seeds from {seeds[0]}; cf1's peers")
+    print(f"{given.noise} noise, {given.flights} flights, seeds from {seeds[0]}; peers of cf1")
     print(
         f"{'case':<24}{'way':<10}{'RMSE':>6}{'worst':>7}{'ellipse':>9}{'kept':>8}{'bad':>8}"
         f"{'worst':>8}{'cpu-s':>7}"
     )
     rows = []
     for name in given.only or CASES:
-        for row in rows_of(name, given.noise, seeds):
+        for row in measure_case(name, given.noise, seeds):
             rows.append(row)
             print(row, flush=True)
     if given.json:

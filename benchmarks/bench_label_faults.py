@@ -1,10 +1,11 @@
-"""Labels while something goes wrong: which methods stay right, and which say when they are not.
+"""Compare labelling methods on flights with faults: which stay accurate, and which report errors.
 
 Run as ``python benchmarks/bench_label_faults.py [--flights 10] [--noise calibrated] [--json FILE]
-[--plot STEM]``. Flights of 100 s in view with one fault each, both ranging directions; both robots
-as observers, by `dmrl label`'s batch solve, by the published filter, and by a plain factor graph
-where gtsam is installed (``pip install gtsam``, or the dependency group ``bench``). All three go
-through the same gate. The batch solve has ceilings; where it is over one, the exit status is 1.
+[--plot STEM]``. Each flight lasts 100 s with the peer in view, and has one fault and ranges in both
+directions. Both robots are observers. The methods are the batch solve of `dmrl label`, the
+published filter, and a plain factor graph if gtsam is installed (``pip install gtsam``, or the
+dependency group ``bench``). All three use the same gate. The batch solve has limits; if it exceeds
+one, the exit status is 1.
 """
 
 import argparse
@@ -36,16 +37,16 @@ from dmrl.labelling.sensor_logs import RobotLog
 
 SETTLE_S = 20.0
 MARGIN_S = 1.0
-"""Around a window that counts as inside it."""
+"""Margin around the window of a fault that counts as part of it, seconds."""
 HEAD = (
     f"{'fault':<24}{'method':<11}{'RMSE':>6}{'outside':>9}{'ellipse':>9}{'kept':>7}{'bad':>8}"
     f"{'worst':>8}{'cpu-s':>8}"
 )
 Found = tuple[Array, Array, Mask]
-"""Positions (N, 2) of the peer, covariances (N, 2, 2), and which are kept (N,)."""
+"""Positions (N, 2) of the peer, metres, covariances (N, 2, 2), and which are kept (N,)."""
 
 
-def pair_of(flight: Flight, one: str, other: str) -> Pair:
+def build_pair(flight: Flight, one: str, other: str) -> Pair:
     """Return a pair as `dmrl label` would read it from a recording of the flight."""
     logs = [_signals(flight, robot) for robot in (one, other)]
     start_s, end_s = max(log.start_s for log in logs), min(log.end_s for log in logs)
@@ -72,72 +73,73 @@ def _signals(flight: Flight, robot: str) -> RobotLog:
     return RobotLog(*((log.time_s[at], v[at]) for at, v in zip(sensed, columns, strict=True)))
 
 
-def batch(pairs: list[Pair]) -> list[tuple[Found, Found]]:
-    """`dmrl label`'s: the peer seen by the observer, and the observer seen by the peer."""
+def solve_batch(pairs: list[Pair]) -> list[tuple[Found, Found]]:
+    """Solve the pairs like `dmrl label`; return both directions of each."""
     both = zip(pairs, estimate_pairs(pairs), strict=True)
     return [(_at(here, pair), _at(there, pair)) for pair, (here, there) in both]
 
 
-def published(pairs: list[Pair]) -> list[tuple[Found, Found]]:
-    """Run the filter of Li et al. 2020, as ``dmrl label --method ekf``."""
+def run_published_filter(pairs: list[Pair]) -> list[tuple[Found, Found]]:
+    """Run the filter of Li et al. 2020, like ``dmrl label --method ekf``."""
     both = [*pairs, *(pair.swap_robots() for pair in pairs)]
     found = [_at(e, p) for e, p in zip(estimate_ekf(both, "published-sim"), both, strict=True)]
     return list(zip(found[: len(pairs)], found[len(pairs) :], strict=True))
 
 
 def _at(estimate: Estimate, pair: Pair) -> Found:
-    xy, spread, status = estimate.interpolate_at(times(pair))
+    xy, spread, status = estimate.interpolate_at(list_times(pair))
     return xy, spread, status == OK
 
 
-def graph(pairs: list[Pair]) -> list[tuple[Found, Found]]:
-    """Solve the factor graph without causes."""
+def solve_graph(pairs: list[Pair]) -> list[tuple[Found, Found]]:
+    """Solve the plain factor graph, which has no error models."""
     import graph_peer  # noqa: PLC0415  # gtsam is optional
 
     out = []
     for pair in pairs:
         here, there = graph_peer.solve(pair)
-        out.append((_of_graph(pair, *here), _of_graph(pair, *there)))
+        out.append((_interpolate_graph(pair, *here), _interpolate_graph(pair, *there)))
     return out
 
 
-def _of_graph(pair: Pair, key_s: Array, state: Array, covariance: Array) -> Found:
-    status, time_s = classify_positions(state, covariance), times(pair)
+def _interpolate_graph(pair: Pair, key_s: Array, state: Array, covariance: Array) -> Found:
+    status, time_s = classify_positions(state, covariance), list_times(pair)
     at = np.clip(np.searchsorted(key_s, time_s), 0, len(key_s) - 1)
     xy = np.stack([np.interp(time_s, key_s, axis) for axis in state[:, :2].T], axis=1)
     return xy, covariance[at, :2, :2], status[at] == OK
 
 
-def times(pair: Pair) -> Array:
-    """(N,) at which a pair is judged, 20 a second."""
+def list_times(pair: Pair) -> Array:
+    """Return the (N,) times at which a pair is evaluated, 20 per second."""
     return np.arange(pair.time_s[0], pair.time_s[-1], 0.05)
 
 
 METHODS: dict[str, Callable[[list[Pair]], list[tuple[Found, Found]]]] = {
-    "batch": batch,
-    "published": published,
-    "graph": graph,
+    "batch": solve_batch,
+    "published": run_published_filter,
+    "graph": solve_graph,
 }
 
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """A fault under a method: medians over flights and directions, shares of samples.
+    """Figures of a fault and a method: medians over flights and directions, shares of samples.
 
     Parameters
     ----------
     noise, fault, method
-        What was flown, and how it was solved.
+        Noise preset, name of the case, and method.
     rmse_m, outside_m
-        Horizontal, after 20 s; and without the windows of the faults.
+        Horizontal RMSE after 20 s: of all samples, and of those outside the windows of the faults.
     ellipse
         Share of samples inside the 95 % ellipse, after 20 s.
     kept, bad, worst
-        Share with status OK; of these over 0.3 m off, and in the worst flight.
+        Share with status OK; share of these with an error over 0.3 m, and that share in the worst
+        flight.
     cpu_s
-        CPU seconds of a flight, both directions.
+        CPU seconds per flight, both directions.
     over
-        Ceilings that it is over.
+        Limits that it exceeds.
     """
 
     noise: str
@@ -160,7 +162,7 @@ class Row:
         ).rstrip()
 
 
-def judged(
+def evaluate(
     flight: Flight, robot: str, peer: str, time_s: Array, found: Found
 ) -> EvaluatedPositions:
     """Compare the estimates with the truth."""
@@ -170,8 +172,11 @@ def judged(
     return EvaluatedPositions(time_s - time_s[0], xy - truth, covariance, distance, kept)
 
 
-def outside(flight: Flight, true_s: Array) -> Mask:
-    """(N,) times at which nothing that has an end is going on, or was a second ago."""
+def find_calm(flight: Flight, true_s: Array) -> Mask:
+    """Return (N,) whether a time is at least a second away from every fault.
+
+    Faults that last for the whole flight do not count.
+    """
     calm = np.ones(len(true_s), bool)
     for start, end in (w for event in flight.faults for w in event.windows_s.tolist()):
         whole = start <= 0 and not np.isfinite(end)
@@ -179,28 +184,28 @@ def outside(flight: Flight, true_s: Array) -> Mask:
     return calm
 
 
-def rows_of(name: str, noise: str, seeds: range, methods: list[str]) -> list[Row]:
-    """Yield the figures of a fault for every method."""
+def measure_case(name: str, noise: str, seeds: range, methods: list[str]) -> list[Row]:
+    """Simulate the flights of a case; return the figures of every method."""
     flights = [simulate(Scenario(), NOISE[noise], seed, CASES[name].faults) for seed in seeds]
-    pairs = [pair_of(flight, "cf1", "cf2") for flight in flights]
+    pairs = [build_pair(flight, "cf1", "cf2") for flight in flights]
     rows = []
     for method in methods:
         begun = time.process_time()
         found = METHODS[method](pairs)
         spent_s = (time.process_time() - begun) / len(seeds)
-        seen = [_seen(*one) for one in zip(flights, pairs, found, strict=True)]
+        seen = [_evaluate_both(*one) for one in zip(flights, pairs, found, strict=True)]
         rows.append(_row(name, noise, method, seen, spent_s))
     return rows
 
 
-def _seen(
+def _evaluate_both(
     flight: Flight, pair: Pair, found: tuple[Found, Found]
 ) -> list[tuple[EvaluatedPositions, Mask]]:
-    """Both directions of a flight beside the truth, and where nothing goes wrong."""
-    time_s = times(pair)
-    calm = outside(flight, flight.clocks["cf1"].to_true_time(time_s))
+    """Compare both directions of a flight with the truth; also return which samples are calm."""
+    time_s = list_times(pair)
+    calm = find_calm(flight, flight.clocks["cf1"].to_true_time(time_s))
     both = zip((("cf1", "cf2"), ("cf2", "cf1")), found, strict=True)
-    return [(judged(flight, *names, time_s, what), calm) for names, what in both]
+    return [(evaluate(flight, *names, time_s, what), calm) for names, what in both]
 
 
 def _row(
@@ -212,15 +217,15 @@ def _row(
 ) -> Row:
     ways = [way for both in flown for way in both]
     late = [j.time_s >= SETTLE_S for j, _ in ways]
-    rmse = [_root(j.error_norm_m[at]) for (j, _), at in zip(ways, late, strict=True)]
-    calm = [_root(j.error_norm_m[at & quiet]) for (j, quiet), at in zip(ways, late, strict=True)]
+    rmse = [_rms(j.error_norm_m[at]) for (j, _), at in zip(ways, late, strict=True)]
+    calm = [_rms(j.error_norm_m[at & quiet]) for (j, quiet), at in zip(ways, late, strict=True)]
     inside = np.concatenate([mahalanobis_squared(j) <= CHI2_95_OF_2 for j, _ in ways])
     bad = [
         np.concatenate([j.error_norm_m[j.kept] > MAX_GOOD_ERROR_M for j, _ in both])
         for both in flown
     ]
     every = np.concatenate(bad)
-    return _held(
+    return _check_limits(
         Row(
             noise=noise,
             fault=name,
@@ -236,12 +241,12 @@ def _row(
     )
 
 
-def _root(size_m: Array) -> float:
+def _rms(size_m: Array) -> float:
     return float(np.sqrt(np.mean(size_m**2))) if len(size_m) else np.nan
 
 
-def _held(row: Row) -> Row:
-    """Return the row with the limits that it exceeds."""
+def _check_limits(row: Row) -> Row:
+    """Return the row with the limits that it exceeds; only the batch solve has limits."""
     if row.method != "batch":
         return row
     case, (bad, worst) = CASES[row.fault], BAD[row.noise]
@@ -259,7 +264,7 @@ def _held(row: Row) -> Row:
 
 
 def draw(rows: list[Row], stem: Path) -> None:
-    """Error, share kept and share bad of every fault, by method."""
+    """Draw RMSE, share in the ellipse, share kept and share bad of every fault, by method."""
     faults = list(dict.fromkeys(row.fault for row in rows))
     figure = Figure((10.0, 0.6 + 0.27 * len(faults)), layout="constrained")
     panels = figure.subplots(1, 4, sharey=True)
@@ -269,7 +274,7 @@ def draw(rows: list[Row], stem: Path) -> None:
     ):
         for method, mark in zip(METHODS, "osx", strict=True):
             if not (mine := [row for row in rows if row.method == method]):
-                continue  # the legend names what was run
+                continue  # methods that were not run do not appear in the legend
             places = [faults.index(row.fault) for row in mine]
             axes.plot([getattr(row, key) for row in mine], places, mark, label=method, alpha=0.8)
         axes.set_title(title, fontsize=9)
@@ -279,36 +284,37 @@ def draw(rows: list[Row], stem: Path) -> None:
     panels[0].set(xscale="log", yticks=range(len(faults)), yticklabels=faults, xlim=(0.05, 5.0))
     panels[0].set_xticks([0.1, 1.0], ["0.1", "1"])
     panels[0].invert_yaxis()
-    # Below the panels: within one it covers points.
+    # The legend lies below the panels, since inside one it would cover points.
     figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
     figure.savefig(stem.with_suffix(".png"), dpi=130)
 
 
 def main() -> int:
-    """Print the table; 1 if the batch solve is over a ceiling."""
+    """Print the table; return 1 if the batch solve exceeds a limit, else 0."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--flights", type=int, default=10)
     parser.add_argument("--first-seed", type=int, default=0)
     parser.add_argument("--noise", choices=list(BAD), default="calibrated")
     parser.add_argument("--only", choices=list(CASES), action="append", help="may be repeated")
-    parser.add_argument("--method", choices=list(METHODS), action="append", help="likewise")
-    parser.add_argument("--json", type=Path, help="write the rows there too")
+    parser.add_argument("--method", choices=list(METHODS), action="append", help="may be repeated")
+    parser.add_argument("--json", type=Path, help="also write the rows to this file")
     parser.add_argument("--plot", type=Path, help="draw STEM.png")
     parser.add_argument(
-        "--beside", type=Path, action="append", default=[], help="JSON of other methods, drawn too"
+        "--beside", type=Path, action="append", default=[], help="JSON of other runs to draw, too"
     )
     given = parser.parse_args()
     methods = given.method or list(METHODS)
     if "graph" in methods and importlib.util.find_spec("gtsam") is None:
         methods.remove("graph")
-        print("no graph: gtsam is not installed. pip install gtsam", file=sys.stderr)
+        print("skipped graph: it needs gtsam. pip install gtsam", file=sys.stderr)
     seeds = range(given.first_seed, given.first_seed + given.flights)
     print(f"{given.noise} noise, {given.flights} flights of 100 s in view, seeds from {seeds[0]}")
-    print("RMSE, outside (of the fault's windows), ellipse: after 20 s; bad: kept and 0.3 m off")
+    print("RMSE and ellipse: after 20 s; outside: RMSE outside the windows of the fault")
+    print("bad: share of kept positions with an error over 0.3 m; worst: that of the worst flight")
     print(HEAD)
     rows = []
     for name in given.only or CASES:
-        rows += rows_of(name, given.noise, seeds, methods)
+        rows += measure_case(name, given.noise, seeds, methods)
         print(*rows[-len(methods) :], sep="\n", flush=True)
     if given.json:
         given.json.write_text(json.dumps([asdict(row) for row in rows], indent=1) + "\n")

@@ -1,13 +1,13 @@
-"""Judge labels: flights without a fault, with injected ones, with cameras, and real ones.
+"""Evaluate labels of flights without faults, with injected faults, with cameras, and real flights.
 
 Run as ``make bench-labels``, or ``python benchmarks/bench_label_judge.py FOLDER [--state
 NAME=COMMAND ...] [--sets sound faults thirds unlisted eyes real] [--noise calibrated] [--flights 5]
-[--only PATTERN] [--data DIR] [--json FILE]``. FOLDER keeps the flights, which are made once, and
-the figures of each flight by state: what is there is not run again. A state is a command that runs
-some checkout's dmrl; without one, this environment's counts.
+[--only PATTERN] [--data DIR] [--json FILE]``. FOLDER keeps the flights and the figures of each
+flight by state; a later run computes only what is missing. A state is a version of dmrl: a name
+and the command that runs it. By default it is the dmrl of this environment.
 
-Faults are injected into recordings of sound flights. Errors are horizontal, of all positions,
-kept or not, from the first second. DIR holds ``nanobench`` and ``uwb-tiers``.
+Faults are injected into recordings of sound flights. Errors are horizontal, and count for all
+positions from the first second, whether kept or not. DIR holds ``nanobench`` and ``uwb-tiers``.
 """
 
 import argparse
@@ -29,11 +29,11 @@ from label_judge.figures import FlightFigures, RowFigures, combine, judge_flight
 from label_judge.jobs import NOISES, SETS, Job, list_jobs, shift_seeds
 
 FOLDER_SIZE = 10
-"""Recordings of one run of the command."""
+"""Largest number of recordings in one run of the command."""
 
 
 def label(command: str, jobs: Sequence[Job], folder: Path) -> dict[str, FlightFigures]:
-    """Label some flights by a command, as a folder, and judge them."""
+    """Label a folder with some flights by a command, and evaluate the labels."""
     with tempfile.TemporaryDirectory(dir=folder) as place:
         here, out = Path(place) / "in", Path(place) / "out"
         here.mkdir()
@@ -69,7 +69,7 @@ def label(command: str, jobs: Sequence[Job], folder: Path) -> dict[str, FlightFi
 
 
 def read_figures(path: Path) -> dict[str, FlightFigures]:
-    """Read the figures that a state has already."""
+    """Return the stored figures of a state, by key of the flight; empty if there are none."""
     if not path.exists():
         return {}
     rows = [json.loads(line) for line in path.read_text().splitlines()]
@@ -79,7 +79,7 @@ def read_figures(path: Path) -> dict[str, FlightFigures]:
 def run_state(
     name: str, command: str, jobs: Sequence[Job], folder: Path, data: Path | None
 ) -> dict[str, FlightFigures]:
-    """Label the flights that a state has no figures of yet."""
+    """Label and evaluate the flights that have no figures of this state; return all figures."""
     path = folder / f"{name}.jsonl"
     have = read_figures(path)
     missing = [job for job in jobs if job.key not in have]
@@ -100,7 +100,7 @@ def run_state(
 
 
 def _split(jobs: Sequence[Job]) -> Iterator[tuple[Job, ...]]:
-    """Folders of recordings with the same flags."""
+    """Yield groups of at most `FOLDER_SIZE` jobs with equal options of `dmrl label`."""
     for options in dict.fromkeys(job.options for job in jobs):
         same = [job for job in jobs if job.options == options]
         for first in range(0, len(same), FOLDER_SIZE):
@@ -112,7 +112,10 @@ HEAD = (
     f"{'s/b':>6}{'in 95':>7}{'least':>7}{'kept':>6}{'/limit':>7}{'/sound':>7}{'bad':>7}{'worst':>7}"
     f"{'said':>6}{'near':>6}{'fail':>5}{'cpu-s':>7}"
 )
-"""R/b: median RMSE over the bound; s/b: stated sigma over it; least: of a flight in its ellipse."""
+"""R/b and s/b: median RMSE and stated sigma over the bound; least: smallest share in the ellipse.
+
+/limit and /sound: positions kept, over those that the bound allows and those of a sound flight.
+"""
 
 
 def print_row(row: str, noise: str, state: str, f: RowFigures) -> None:
@@ -146,7 +149,7 @@ def print_row(row: str, noise: str, state: str, f: RowFigures) -> None:
 def build_table(
     jobs: Sequence[Job], states: dict[str, dict[str, FlightFigures]]
 ) -> list[dict[str, Any]]:
-    """Build and print the table: a line for each row, noise and state."""
+    """Print a line for each row, noise and state; return them for JSON."""
     table = []
     print(HEAD)
     for kind, row, noise in dict.fromkeys((job.kind, job.row, job.noise) for job in jobs):
@@ -165,13 +168,13 @@ def build_table(
 
 
 HONEST = {"calibrated": (0.01, 0.05), "realistic": (0.02, 0.10)}
-"""Largest bad shares of what a row keeps, over all flights and in the worst."""
+"""Largest share of kept positions that may be bad, over all flights and in the worst flight."""
 MIN_KEPT, MIN_KEPT_OF_SOUND = 0.01, 0.6
-"""Share below which a row counts as refused; share of a flight without the fault to keep."""
+"""Kept share below which a row counts as refused; share of the positions kept without the fault."""
 
 
 def summarise(table: Sequence[dict[str, Any]]) -> None:
-    """Print how many lines of faults are honest, useful, and have their cause named."""
+    """Print in how many lines of faults the labels are honest, useful, and name the cause."""
     lines = [line for line in table if line["set"] in ("faults", "thirds", "unlisted")]
     for kind, state in dict.fromkeys((line["set"], line["state"]) for line in lines):
         mine = [line for line in lines if (line["set"], line["state"]) == (kind, state)]
@@ -188,26 +191,26 @@ def summarise(table: Sequence[dict[str, Any]]) -> None:
         told = [line["near"] >= 0.5 for line in mine if line["cause"]]
         print(
             f"{kind}, {state}: of {len(mine)} lines (row and noise) {sum(honest)} are honest or "
-            f"refused, {sum(useful)} keep {MIN_KEPT_OF_SOUND:.0%} of a sound flight; of "
-            f"{len(told)} with a cause {sum(told)} are told near it"
+            f"refused, and {sum(useful)} keep {MIN_KEPT_OF_SOUND:.0%} of a sound flight; of "
+            f"{len(told)} lines with a cause, {sum(told)} name it"
         )
 
 
 def main() -> None:
-    """Run the states and print the table."""
+    """Label the flights with each state, and print the table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--state", action="append", default=[], help="NAME=COMMAND, repeatable")
     parser.add_argument("--sets", nargs="+", choices=SETS, default=["sound", "faults"])
     parser.add_argument("--noise", nargs="+", choices=NOISES, default=list(NOISES))
-    parser.add_argument("--flights", type=int, default=5, help="of each row")
+    parser.add_argument("--flights", type=int, default=5, help="flights per row")
     parser.add_argument("--only", help="pattern of rows")
     parser.add_argument(
-        "--seed-shift", type=int, default=0, help="added to all seeds; with a FOLDER of its own"
+        "--seed-shift", type=int, default=0, help="added to all seeds; use another FOLDER for each"
     )
-    parser.add_argument("--data", type=Path, help="folder of nanobench and uwb-tiers")
-    parser.add_argument("--no-run", action="store_true", help="print the figures that are there")
-    parser.add_argument("--json", type=Path, help="write the table there too")
+    parser.add_argument("--data", type=Path, help="folder with nanobench and uwb-tiers")
+    parser.add_argument("--no-run", action="store_true", help="print the stored figures only")
+    parser.add_argument("--json", type=Path, help="also write the table to this file")
     given = parser.parse_args()
     here = f"{shlex.quote(sys.executable)} -m dmrl.cli"
     commands = dict(text.split("=", 1) for text in given.state) or {"here": here}

@@ -1,10 +1,11 @@
-"""Labels of robots whose sensors are off, without and with what earlier flights agree on.
+"""Measure what `dmrl calibrate --sensors` gains for robots with constant sensor errors.
 
 Run as ``python benchmarks/bench_label_sensors.py FOLDER [--noise realistic] [--flights 6]
-[--first-seed 9100]``. Two robots fly in view: their ranges are 0.35 m too long, cf2's yaw rate is
-off by 0.05 rad/s, cf1's velocities are 15 % too large, and the preset's constants come on top,
-drawn anew for every flight. `dmrl calibrate --sensors` learns from flights of 100 s, and `dmrl
-label` is given others, short and long, without and with what it wrote.
+[--first-seed 9100]``. Two robots fly in view of each other. Their ranges are 0.35 m too long, the
+yaw rate of cf2 is off by 0.05 rad/s, and the velocities of cf1 are 15 % too large. The constant
+errors of the noise preset are added, drawn anew for every flight. `dmrl calibrate --sensors` learns
+from flights of 100 s. `dmrl label` then processes other flights, short and long, without and with
+the calibration.
 """
 
 import argparse
@@ -26,7 +27,7 @@ FIGURES = "rmse_m", "coverage_95", "kept", "precision"
 
 
 def main() -> None:
-    """Fly, calibrate, label and judge; print a table."""
+    """Simulate, calibrate, label and evaluate; print a table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--noise", default="realistic")
@@ -36,7 +37,7 @@ def main() -> None:
     given.folder.mkdir()
     seeds = iter(range(given.first_seed, given.first_seed + 100_000))
 
-    def flown(length_s: float) -> list[Path]:
+    def simulate_flights(length_s: float) -> list[Path]:
         settings = [
             fly.Settings(2, length_s, noise=given.noise, seed=next(seeds), faults=list(OFF))
             for _ in range(given.flights)
@@ -47,18 +48,18 @@ def main() -> None:
         return paths
 
     known = given.folder / "sensors.toml"
-    calibrate.run(flown(100.0), known, calibrate.Settings(sensors=True))
+    calibrate.run(simulate_flights(100.0), known, calibrate.Settings(sensors=True))
     rows = []
     for length_s in LENGTHS_S:
-        flights = flown(length_s)
+        flights = simulate_flights(length_s)
         for name, sensors in (("without", None), ("with", known)):
-            rows.append((f"{length_s:g}", name, *_judged(flights, name, sensors)))
+            rows.append((f"{length_s:g}", name, *_evaluate(flights, name, sensors)))
     head = "RMSE, m", "in the 95 % ellipse", "kept", "bad of kept"
-    print_table(f"{given.noise} noise", ("flights, s", "sensors.toml", *head), rows)
+    print_table(f"{given.noise} noise", ("length, s", "sensors.toml", *head), rows)
 
 
-def _judged(flights: list[Path], name: str, sensors: Path | None) -> tuple[float, ...]:
-    """Median error over flights; means over them of what is inside, kept, and bad of that."""
+def _evaluate(flights: list[Path], name: str, sensors: Path | None) -> tuple[float, ...]:
+    """Label the flights; return median RMSE and shares in the ellipse, kept, and bad of kept."""
     found = []
     for flight in flights:
         out = flight.with_suffix(f".{name}.mcap")

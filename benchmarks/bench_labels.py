@@ -1,9 +1,9 @@
-"""Relative positions from simulated UWB and flow: error, honesty, gate and cost.
+"""Evaluate relative positions from simulated UWB and flow: error, consistency, gate and cost.
 
-Run as ``python benchmarks/bench_labels.py [--flights 50] [--only in_view]``. Monte Carlo: for
-each noise preset and trajectory so many flights of 100 s, the position of cf2 as cf1 sees it,
-by the batch solve and by the published filter; and what the best gate could keep. Then the cost,
-in CPU seconds, against the length of a flight and the number of robots; ``--plot STEM`` draws it.
+Run as ``python benchmarks/bench_labels.py [--flights 50] [--only in_view]``. Simulates flights of
+100 s for each noise preset and trajectory. The position of cf2 relative to cf1 is estimated by the
+batch solve and by the published filter, and compared with what an ideal gate would keep. Then
+prints the CPU seconds by length of the flight and by number of robots; ``--plot STEM`` draws them.
 """
 
 import argparse
@@ -43,16 +43,16 @@ HEAD = (
 
 @dataclass(frozen=True, slots=True)
 class Flown:
-    """One flight's figures, and what a gate could go by.
+    """Figures of one flight, and the data to find the best gate.
 
     Parameters
     ----------
     figures
-        As `dmrl evaluate` has them.
+        Figures as printed by `dmrl evaluate`.
     probability
-        (N,) of each sample's being bad, as the estimate has it; infinite where AMBIGUOUS.
+        (N,) probability that a sample is bad, from its covariance; infinite where AMBIGUOUS.
     bad
-        (N,) whether it is.
+        (N,) whether the error is larger than 0.3 m.
     """
 
     figures: PairFigures
@@ -60,27 +60,27 @@ class Flown:
     bad: Mask
 
 
-def pair_of(flight: Flight, robot: str, peer: str) -> Pair:
-    """Return the data that cf1 would have: both logs with their time stamps, and its own ranges."""
+def build_pair(flight: Flight, robot: str, peer: str) -> Pair:
+    """Return both logs with their time stamps, and only the ranges that the robot measured."""
     logs = flight.robots[robot], flight.robots[peer]
     start, end = max(log.time_s[0] for log in logs), min(log.time_s[-1] for log in logs)
     grid_s = start + np.arange(int((end - start) * 100)) / 100
     ranges = flight.ranges[robot, peer]
     inside = (ranges.time_s >= grid_s[0]) & (ranges.time_s <= grid_s[-1])
     inside &= usable_ranges(ranges.time_s, ranges.range_m)
-    own, other = (track_of(log, grid_s) for log in logs)
+    own, other = (resample(log, grid_s) for log in logs)
     return Pair(grid_s, own, other, ranges.time_s[inside], ranges.range_m[inside])
 
 
-def track_of(log: RobotLog, grid_s: Array) -> SensorTrack:
-    """Resample a robot's log on a common time grid."""
+def resample(log: RobotLog, grid_s: Array) -> SensorTrack:
+    """Resample the log of a robot on a common time grid."""
     velocity = np.stack([log.vx_mps, log.vy_mps], axis=1)
     yaw_rate, height = log.yaw_rate_radps[:, None], log.height_m[:, None]
     return sensed(*((log.time_s, values) for values in (yaw_rate, velocity, height)), grid_s)
 
 
-def judged(flight: Flight, robot: str, peer: str, estimate: Estimate) -> Flown:
-    """Compare an estimate with the truth, 20 times a second."""
+def evaluate(flight: Flight, robot: str, peer: str, estimate: Estimate) -> Flown:
+    """Compare an estimate with the truth, 20 times per second."""
     time_s = np.arange(estimate.time_s[0], estimate.time_s[-1], 0.05)
     position, covariance, status = estimate.interpolate_at(time_s)
     truth = flight.peer_in_horizontal(robot, peer, flight.clocks[robot].to_true_time(time_s))[:, :2]
@@ -94,8 +94,11 @@ def judged(flight: Flight, robot: str, peer: str, estimate: Estimate) -> Flown:
     return Flown(compute_figures(both, SETTLE_S), probability, both.error_norm_m > MAX_GOOD_ERROR_M)
 
 
-def best_gate(flown: list[Flown]) -> float:
-    """Share of all samples that the best limit on the probability keeps, chosen in hindsight."""
+def compute_best_gate(flown: list[Flown]) -> float:
+    """Return the share of samples kept by the best limit on the probability.
+
+    The limit is chosen with the truth known, such that at most `BAD_SHARE` of the samples are bad.
+    """
     probability = np.concatenate([f.probability for f in flown])
     order = np.argsort(probability, kind="stable")
     count = np.arange(1, np.isfinite(probability).sum() + 1)
@@ -103,15 +106,15 @@ def best_gate(flown: list[Flown]) -> float:
     return float(count[bad <= BAD_SHARE * count].max(initial=0) / len(probability))
 
 
-def monte_carlo(
+def run_monte_carlo(
     noise: str, trajectory: str, seeds: range, methods: tuple[str, ...]
 ) -> dict[str, tuple[list[Flown], float]]:
-    """Every flight, judged, and CPU seconds of one, by method."""
+    """Return the evaluated flights and the CPU seconds per flight, by method."""
     flown = [
         simulate(Scenario(trajectory=trajectory), NOISE[noise], seed)  # type: ignore[arg-type]
         for seed in seeds
     ]
-    pairs = [pair_of(flight, "cf1", "cf2") for flight in flown]
+    pairs = [build_pair(flight, "cf1", "cf2") for flight in flown]
     solve = {
         "batch": lambda: [here for here, _ in estimate_pairs(pairs)],
         "published": lambda: estimate_ekf(pairs, EKF),
@@ -122,12 +125,12 @@ def monte_carlo(
         estimates = solve[name]()
         cost_s = (time.process_time() - begun) / len(seeds)
         both = zip(flown, estimates, strict=True)
-        out[name] = [judged(f, "cf1", "cf2", e) for f, e in both], cost_s
+        out[name] = [evaluate(f, "cf1", "cf2", e) for f, e in both], cost_s
     return out
 
 
-def line(noise: str, trajectory: str, method: str, flown: list[Flown], cost_s: float) -> str:
-    """One row of the table: medians over flights, shares of flights or of samples."""
+def format_row(noise: str, trajectory: str, method: str, flown: list[Flown], cost_s: float) -> str:
+    """Return a row of the table: medians over flights, and shares of flights or of samples."""
     found = [f.figures for f in flown]
     every, worst = combine_figures(found), max(f.rmse_m for f in found)
     return (
@@ -137,22 +140,22 @@ def line(noise: str, trajectory: str, method: str, flown: list[Flown], cost_s: f
     )
 
 
-def cost(robots: int, duration_s: float, flights: int) -> float:
-    """CPU seconds for all ordered pairs of a flight."""
+def measure_cost(robots: int, duration_s: float, flights: int) -> float:
+    """Return the CPU seconds to solve all ordered pairs of a flight."""
     spent_s = 0.0
     for seed in range(flights):
         flight = simulate(Scenario(robots, duration_s, "random"), NOISE["realistic"], seed)
-        pairs = [pair_of(flight, *both) for both in combinations(flight.robots, 2)]
+        pairs = [build_pair(flight, *both) for both in combinations(flight.robots, 2)]
         begun = time.process_time()
         estimate_pairs(pairs)
         spent_s += time.process_time() - begun
     return spent_s / flights
 
 
-def costs(stem: Path | None) -> None:
-    """Print, and draw, the cost against length and robots."""
-    lengths = [(s, cost(2, s, 3)) for s in (25.0, 50.0, 100.0, 200.0, 400.0)]
-    swarms = [(n * (n - 1), cost(n, 100.0, 1)) for n in (2, 3, 5, 7, 10)]
+def print_costs(stem: Path | None) -> None:
+    """Print the cost by length of the flight and by number of pairs; draw it if a path is given."""
+    lengths = [(s, measure_cost(2, s, 3)) for s in (25.0, 50.0, 100.0, 200.0, 400.0)]
+    swarms = [(n * (n - 1), measure_cost(n, 100.0, 1)) for n in (2, 3, 5, 7, 10)]
     for what, rows in (("seconds of flight, 2 pairs", lengths), ("pairs, 100 s", swarms)):
         print(f"\n{what:>28}   cpu-s")
         for size, seconds in rows:
@@ -171,24 +174,25 @@ def costs(stem: Path | None) -> None:
         figure.savefig(stem.with_suffix(".png"), dpi=150)
 
 
-def tables(given: argparse.Namespace) -> None:
-    """Print the figures of every noise preset and trajectory asked for, and of all together."""
+def print_figures(given: argparse.Namespace) -> None:
+    """Print the figures of each noise preset by trajectory, and over all trajectories."""
     print(f"{given.flights} flights of 100 s each; RMSE, 95 % and coverage after {SETTLE_S:g} s")
-    print("kept: status OK; good: kept samples within 0.3 m; the second coverage: of kept samples")
-    print(f"best gate: the limit on the probability that keeps most with {BAD_SHARE:.0%} bad")
+    print("kept: status OK; good: kept samples within 0.3 m; second coverage: of kept samples")
+    print(f"best gate: limit on the probability that keeps most samples with {BAD_SHARE:.0%} bad")
     print(HEAD)
     seeds = range(given.first_seed, given.first_seed + given.flights)
     methods = ("batch",) if given.no_published else ("batch", "published")
     for noise in [given.noise] if given.noise else PRESETS:
         every: dict[str, list[Flown]] = {}
         for trajectory in [given.only] if given.only else TRAJECTORIES:
-            for method, (flown, cost_s) in monte_carlo(noise, trajectory, seeds, methods).items():
-                print(line(noise, trajectory, method, flown, cost_s), flush=True)
+            found = run_monte_carlo(noise, trajectory, seeds, methods)
+            for method, (flown, cost_s) in found.items():
+                print(format_row(noise, trajectory, method, flown, cost_s), flush=True)
                 every.setdefault(method, []).extend(flown)
         for method, flown in every.items():
-            print(line(noise, "all of these", method, flown, float("nan")))
-        share = best_gate(every["batch"])
-        print(f"{noise}: the best gate, chosen in hindsight, keeps {share:.1%} of batch's\n")
+            print(format_row(noise, "all of these", method, flown, float("nan")))
+        share = compute_best_gate(every["batch"])
+        print(f"{noise}: the best gate keeps {share:.1%} of the samples of the batch solve\n")
 
 
 def main() -> None:
@@ -198,15 +202,15 @@ def main() -> None:
     parser.add_argument("--first-seed", type=int, default=0)
     parser.add_argument("--only", choices=list(TRAJECTORIES))
     parser.add_argument("--noise", choices=[n for n in NOISE if n != "ideal"])
-    parser.add_argument("--no-published", action="store_true", help="the batch solve alone")
+    parser.add_argument("--no-published", action="store_true", help="run the batch solve only")
     parser.add_argument("--no-costs", action="store_true")
     parser.add_argument("--costs-only", action="store_true")
     parser.add_argument("--plot", type=Path)
     given = parser.parse_args()
     if not given.costs_only:
-        tables(given)
+        print_figures(given)
     if not given.no_costs:
-        costs(given.plot)
+        print_costs(given.plot)
 
 
 if __name__ == "__main__":

@@ -1,16 +1,16 @@
-"""How like the published images renders are that stand at the same poses.
+"""Compare renders with the published images at the same poses.
 
     python benchmarks/bench_likeness.py DATA/locanet-synthetic [--model crazyflie-published.blend]
         [--images 60] [--plot OUT.jpg] [--renders RENDERS.mcap]
 
-Every published image says where its drone is and how it is turned. The drone is taken out of the
-picture (OpenCV's inpainting), rendered again in its place, and compared: mean absolute difference
-of luma and of both colour channels, of 256 levels, where the drone is. The rest of the difference
-is what inpainting got wrong behind a drone's gaps, so each row is one thing changed. Without a
-model, one row of the violet robot that dmrl draws.
+Every published image comes with the pose of its drone. The drone is removed from the image by
+OpenCV's inpainting and rendered again in its place. The table gives the mean absolute difference of
+luma and of both colour channels, of 256 levels, where the drone is. Part of it comes from
+inpainting errors in the gaps of the drone, so each row changes one setting for comparison. Without
+a model there is one row, with the violet robot of dmrl.
 
-With ``--renders`` a second table says how sharp whole images are: means of the difference from a
-pixel to the next, and to the mean of its four neighbours.
+With ``--renders`` a second table compares the sharpness of whole images: mean differences between a
+pixel and its right neighbour, and between a pixel and the mean of its four neighbours.
 """
 
 import argparse
@@ -41,7 +41,7 @@ from dmrl.terminal.tables import print_table
 
 SCALE = 0.002
 DRAWN_SCALE = 2.0
-YAW_OF_MODEL_RAD = np.radians(270.0)  # dmrl's x is forward, the authors' model looks aside
+YAW_OF_MODEL_RAD = np.radians(270.0)  # x is forward in dmrl; the authors' model faces sideways
 LUMA = np.array([[0.299, 0.587, 0.114], [-0.1687, -0.3313, 0.5], [0.5, -0.4187, -0.0813]])
 AROUND_PX = 3
 IMAGES = "/cf1/camera/image"
@@ -51,7 +51,7 @@ LOOK = Look(np.zeros((224, 320, 3), np.float32), LIGHT, Sensor(brightness=None),
 
 @dataclass(frozen=True, slots=True)
 class Variant:
-    """One way to render: its name, how the model is used, the light, and the look."""
+    """One way to render: its name, model, light and blur."""
 
     name: str
     model: RobotModel
@@ -59,8 +59,8 @@ class Variant:
     blur_px: float = 0.45
 
 
-def variants(path: Path | None) -> list[Variant]:
-    """As the preset has it, and with one thing changed; without a model, as dmrl draws it."""
+def list_variants(path: Path | None) -> list[Variant]:
+    """Return the preset and changes of one setting; without a model, dmrl's own robot."""
     if path is None:
         return [Variant("drawn by dmrl", RobotModel(None, DRAWN_SCALE, design=VIOLET))]
     model = RobotModel(path, SCALE, "y", "origin")
@@ -77,8 +77,8 @@ def variants(path: Path | None) -> list[Variant]:
     ]
 
 
-def robot_of(item: LocanetImage) -> Robot:
-    """Return the drone of a published image."""
+def build_robot(item: LocanetImage) -> Robot:
+    """Return the drone of a published image, at its pose."""
     tilt = Rotation.from_euler("XY", (item.roll_rad, item.pitch_rad))
     roll, pitch, yaw = item.attitude_rad[0]
     body = Rotation.from_euler("XZY", (roll, yaw, pitch))
@@ -87,17 +87,17 @@ def robot_of(item: LocanetImage) -> Robot:
     return Robot(Pose(item.xyz_camera[0], turn.as_matrix()), paint)
 
 
-def covered(shot: Shot) -> NDArray[np.uint8]:
-    """(H, W) 1 where a drone is, and a little around it."""
+def build_mask(shot: Shot) -> NDArray[np.uint8]:
+    """Return an (H, W) mask, 1 on the drone and `AROUND_PX` pixels around it."""
     size = 2 * AROUND_PX + 1
     there = (shot.opacity[0] > 0).astype(np.uint8)
     return np.asarray(cv2.dilate(there, np.ones((size, size), np.uint8)), np.uint8)
 
 
-def shots(
+def render_again(
     items: list[LocanetImage], pictures: list[Rgb], variant: Variant, masks: list[NDArray[np.uint8]]
 ) -> Iterator[Shot]:
-    """Every drone rendered again, over its picture without it."""
+    """Yield each drone rendered over its image, from which the drone under the mask is removed."""
     with Renderer(ensure_environment(say), variant.model, samples=16) as renderer:
         light = replace(variant.light, name=renderer.lights[0])
         look = replace(LOOK, light=light, robot_blur_px=variant.blur_px)
@@ -109,13 +109,13 @@ def shots(
         )
         scenes = zip(items, backs, strict=True)
         yield from renderer.render_shots(
-            (PUBLISHED_RENDER, [robot_of(item)], replace(look, backdrop=back))
+            (PUBLISHED_RENDER, [build_robot(item)], replace(look, backdrop=back))
             for item, back in scenes
         )
 
 
 def main() -> None:
-    """Print the table."""
+    """Print the tables, and draw a sheet with --plot."""
     parser = argparse.ArgumentParser()
     parser.add_argument("data", type=Path)
     parser.add_argument("--model", type=Path)
@@ -127,13 +127,13 @@ def main() -> None:
     chosen = np.random.default_rng(0).permutation(len(items))[: args.images]
     items = [items[k] for k in chosen]
     pictures = [decode(item.path.read_bytes(), item.path) for item in items]
-    ways = variants(args.model)
-    masks = [covered(shot) for shot in shots(items, pictures, ways[0], [])]
+    ways = list_variants(args.model)
+    masks = [build_mask(shot) for shot in render_again(items, pictures, ways[0], [])]
     rows, shown = [], []
     for way in ways:
         off = []
         for rgb, mask, shot in zip(
-            pictures, masks, shots(items, pictures, way, masks), strict=True
+            pictures, masks, render_again(items, pictures, way, masks), strict=True
         ):
             again = decode(encode_jpeg(shot.rgb, 90, subsampled=True), "render")
             difference = (again.astype(float) - rgb) @ LUMA.T
@@ -142,18 +142,18 @@ def main() -> None:
                 shown.append((rgb, again, mask))
         means = [round(float(value), 2) for value in np.mean(off, axis=0)]
         rows.append((way.name, means[0], means[1], means[2]))
-    print_table(f"{len(items)} images", ("rendered", "luma", "blue", "red"), rows)
+    print_table(f"{len(items)} images", ("variant", "luma", "blue", "red"), rows)
     if args.plot:
-        args.plot.write_bytes(sheet(shown))
+        args.plot.write_bytes(draw_sheet(shown))
     if args.renders:
         rendered = (decode(one.message.data) for one in read_messages(args.renders, IMAGES))
         compared = {"published": pictures, "renders": list(islice(rendered, len(pictures)))}
-        sharp = [(name, *sharpness(images)) for name, images in compared.items()]
-        print_table("", ("images", "to the next pixel", "to the mean of four"), sharp)
+        sharp = [(name, *measure_sharpness(images)) for name, images in compared.items()]
+        print_table("", ("images", "to the right pixel", "to the mean of four"), sharp)
 
 
-def sharpness(pictures: list[Rgb]) -> tuple[float, float]:
-    """Mean differences of luma from pixels to the next on the right, and to all four around."""
+def measure_sharpness(pictures: list[Rgb]) -> tuple[float, float]:
+    """Return mean luma differences to the right pixel, and to the mean of the four neighbours."""
     luma = np.array([rgb @ LUMA[0] for rgb in pictures])
     around = luma[:, :-2, 1:-1] + luma[:, 2:, 1:-1] + luma[:, 1:-1, :-2] + luma[:, 1:-1, 2:]
     return (
@@ -162,8 +162,8 @@ def sharpness(pictures: list[Rgb]) -> tuple[float, float]:
     )
 
 
-def sheet(shown: list[tuple[Rgb, Rgb, NDArray[np.uint8]]], columns: int = 6) -> bytes:
-    """Draw published and rendered images side by side, around the drone."""
+def draw_sheet(shown: list[tuple[Rgb, Rgb, NDArray[np.uint8]]], columns: int = 6) -> bytes:
+    """Return a JPEG of published and rendered images side by side, cropped to the drone."""
     tiles = []
     for rgb, again, mask in shown[: 4 * columns]:
         left, top, width, height = cv2.boundingRect(mask)

@@ -1,10 +1,10 @@
-"""Many small recordings: seconds of CPU and memory of index, find, check and dataset, per count.
+"""Measure CPU time and memory of index, find, check and dataset for many small recordings.
 
     python benchmarks/bench_many.py [COUNT...] [--keep FOLDER]
 
-A recording has four images of 64 x 48 px with labels, and four attitudes. Each command is a process
-of its own, with one worker; its memory is what it and its workers held at most. Times of the
-first index of new recordings, and of a second one that finds them known.
+A recording has four images of 64 x 48 px with labels, and four attitudes. Each command runs in its
+own process with one worker; its memory is the peak of it and its workers. Indexing is timed for new
+recordings, and again when all of them are known.
 """
 
 import argparse
@@ -28,8 +28,8 @@ ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_
 
 
 def write_recordings(folder: Path, count: int) -> None:
-    """Write recordings, a thousand to a folder."""
-    atomic_output.sync = lambda path: None  # ten thousand are not worth a disk's time each
+    """Write small recordings, a thousand per folder."""
+    atomic_output.sync = lambda path: None  # syncing ten thousand files would take minutes
     atomic_output.sync_entry = lambda path: None
     rng = np.random.default_rng(0)
     for number in range(count):
@@ -47,8 +47,8 @@ def write_recordings(folder: Path, count: int) -> None:
                 sink.write(at + 1, ATTITUDE(robot), message_class("Attitude")(roll_rad=0.01 * k))
 
 
-def cost(*words: str) -> tuple[float, float]:
-    """Seconds of CPU and most MB of a command and all it starts.
+def measure_cost(*words: str) -> tuple[float, float]:
+    """Return the CPU seconds and the peak memory, MB, of a command and its child processes.
 
     Raises
     ------
@@ -71,7 +71,7 @@ def cost(*words: str) -> tuple[float, float]:
 
 
 def measure(folder: Path, count: int) -> list[tuple[str, int, float, float, float]]:
-    """Measure every command; return a row for each."""
+    """Write the recordings and measure every command; return a row for each."""
     flights, out = folder / "flights", folder / "set"
     write_recordings(flights, count)
     works = {
@@ -83,7 +83,7 @@ def measure(folder: Path, count: int) -> list[tuple[str, int, float, float, floa
     }
     rows = []
     for name, words in works.items():
-        seconds, most = cost(*words)
+        seconds, most = measure_cost(*words)
         rows.append((name, count, seconds, 1e3 * seconds / count, most))
         print(*rows[-1], file=sys.stderr)
     return rows
@@ -93,13 +93,13 @@ def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("counts", nargs="*", type=int, default=[1000, 10_000])
-    parser.add_argument("--keep", type=Path, help="folder that stays")
+    parser.add_argument("--keep", type=Path, help="folder for the recordings; default: temporary")
     given = parser.parse_args()
     rows = []
     for count in given.counts:
         with tempfile.TemporaryDirectory() as scratch:
             rows += measure((given.keep or Path(scratch)) / str(count), count)
-    heads = ("command", "recordings", "cpu-s", "ms each", "MB")
+    heads = ("command", "recordings", "cpu-s", "ms per recording", "peak MB")
     print_table("", heads, sorted(rows, key=lambda row: row[0]))
 
 

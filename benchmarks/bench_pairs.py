@@ -1,12 +1,13 @@
-"""Costs of this dmrl beside those of another installation, of an older commit, in turn.
+"""Compare the costs of this dmrl with those of another installation, usually an older commit.
 
     python benchmarks/bench_pairs.py OTHER/.venv/bin/python [--rounds 5] [--only NAME ...]
         [--folder DIR]
 
-Prints for each row the median of both, the median of the ratios of the pairs, and what a peer
-takes in the same rounds, where there is one. Each figure is CPU time of a process of its own with
-one thread, or is printed by it. The other installation makes the material, in DIR, where it is
-found the next time: 0.5 GB, and 6 GB more for `info`. Without ``--only``, all rows are measured.
+Both run in turns. Prints for each row the median of both, the median ratio of the pairs, and the
+cost of another package in the same rounds, if there is one for this row. Each figure is the CPU
+time of a process with one thread, or is printed by that process. The other installation makes the
+input files in DIR, which a later run reuses: 0.5 GB, and 6 GB more for `info`. Without ``--only``,
+all rows are measured.
 """
 
 import argparse
@@ -71,7 +72,7 @@ READ = (
 import dmrl
 from pathlib import Path
 from dmrl.recording import read_table
-read_table(Path("few.mcap"), "/cf1/camera/image")  # what is imported and made once
+read_table(Path("few.mcap"), "/cf1/camera/image")  # a warm-up: imports and caches
 """
 )
 WINDOW = """
@@ -123,7 +124,7 @@ print(spent(summary))
 
 
 def dmrl(line: str) -> tuple[str, ...]:
-    """Return the code and the words of a command."""
+    """Return the code and arguments that run a command of dmrl."""
     return MAIN, *line.split()
 
 
@@ -140,12 +141,32 @@ MATERIAL: Mapping[str, tuple[str, ...]] = {
     "1": (ATTITUDES + "write('1/million.mcap', 1_000_000, '/cf1/attitude')",),
     "10": (ATTITUDES + "write('10/million.mcap', 10_000_000, '/cf1/attitude')",),
 }
-"""What each file of the folder is made by."""
+"""Code that makes each input file."""
 
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """A figure: what is run, of which another run is subtracted; a peer; files; over how many."""
+    """How a figure is measured.
+
+    Parameters
+    ----------
+    code
+        Code to run, and its arguments.
+    unit
+        Unit of the figure.
+    needs
+        Input files.
+    less
+        Code and arguments of a run whose figure is subtracted, such as the start-up.
+    over
+        Divisor of the figure.
+    peer
+        Code of another package for comparison.
+    prints
+        The code prints its figure; otherwise it is the CPU time, seconds.
+    peak
+        The figure is the peak memory, MB.
+    """
 
     code: tuple[str, ...]
     unit: str
@@ -224,7 +245,7 @@ ROWS: Mapping[str, Row] = {
 
 
 def run(python: str, words: Sequence[str], folder: Path, how: Row | None = None) -> float:
-    """Run a code with its words; return its CPU time, seconds, its peak, MB, or what it prints."""
+    """Run some code; return its CPU time, seconds, its peak memory, MB, or the number it prints."""
     prints = how is not None and how.prints
     for old in [folder / "out", folder / "out.mcap", *folder.glob("*/catalogue.parquet")]:
         shutil.rmtree(old) if old.is_dir() else old.unlink(missing_ok=True)
@@ -234,7 +255,7 @@ def run(python: str, words: Sequence[str], folder: Path, how: Row | None = None)
     text = process.stdout.read() if process.stdout else b""
     _, status, used = os.wait4(process.pid, 0)
     process.returncode = os.waitstatus_to_exitcode(status)
-    # A folder with recordings that fail ends with 1.
+    # A command on a folder with damaged recordings exits with 1.
     if process.returncode not in (0, 1) or (prints and not text):
         raise SystemExit(f"{' '.join(command)[-300:]} ended with {process.returncode}")
     if how is not None and how.peak:
@@ -243,7 +264,7 @@ def run(python: str, words: Sequence[str], folder: Path, how: Row | None = None)
 
 
 def measure(python: str, row: Row, folder: Path) -> float:
-    """Return the figure of a row by one interpreter."""
+    """Return the figure of a row, measured with one interpreter."""
     value = run(python, row.code, folder, row)
     if row.less:
         value -= run(python, row.less, folder, replace(row, prints=False))
@@ -251,7 +272,7 @@ def measure(python: str, row: Row, folder: Path) -> float:
 
 
 def main() -> None:
-    """Measure and print."""
+    """Print a line for each row."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("other", help="interpreter of the other installation")
     parser.add_argument("--rounds", type=int, default=5)
@@ -259,7 +280,7 @@ def main() -> None:
     parser.add_argument("--folder", type=Path)
     given = parser.parse_args()
     os.environ |= dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
-    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # as installed: with bytecode on disk
+    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # an installed dmrl has bytecode on disk
     with tempfile.TemporaryDirectory() as scratch:
         folder = given.folder or Path(scratch)
         folder.mkdir(parents=True, exist_ok=True)
@@ -273,7 +294,7 @@ def main() -> None:
                     raise SystemExit(f"{file} could not be made for {name}")
             pythons = (given.other, sys.executable)
             for python in pythons:
-                measure(python, row, folder)  # what is made once and kept
+                measure(python, row, folder)  # a warm-up: bytecode and caches
             pairs, peers = [], []
             for _ in range(given.rounds):
                 pairs.append([measure(python, row, folder) for python in pythons])

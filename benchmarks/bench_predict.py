@@ -1,10 +1,11 @@
-"""`dmrl predict` beside a plain onnxruntime loop over pictures that are decoded already.
+"""Compare `dmrl predict` with a plain onnxruntime loop over images that are already decoded.
 
 Run as ``python benchmarks/bench_predict.py [--rounds 5] [--json FILE]``. The recording is a flight
-of `dmrl fly` with cameras: pictures and numbers. Everyone has one numeric thread. Figures are
-medians over rounds of CPU time for an image, all threads counted, and of the calling thread's,
-and of the time that passes; ratios are of the same round, to the plain loop over batches of 16. One
-by one it is quicker, as `dmrl predict` knows. What passes is told only where a second core is free.
+of `dmrl fly` with cameras. All use one numeric thread. Figures are medians over rounds of the CPU
+time per image, over all threads and of the calling thread alone. Ratios, also that of the wall
+time, are to the plain loop over batches of 16 in the same round. The plain loop is faster with
+single images, which is why `dmrl predict` also runs them one by one. The wall time is meaningful
+only if a second core is free.
 """
 
 import argparse
@@ -21,7 +22,7 @@ from typing import Any
 
 os.environ |= dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 
-import numpy as np  # after the number of its threads
+import numpy as np  # after the environment variables, which NumPy reads on import
 import onnxruntime
 
 from dmrl.deploy.onnx.float_model import float_onnx_of
@@ -37,8 +38,8 @@ CLOCKS = (time.process_time, time.thread_time, time.perf_counter)
 PLAIN = "onnxruntime, plain loop, batches of 16"
 
 
-def plain_loops(model: Path, recording: Path) -> tuple[int, dict[str, Callable[[], object]]]:
-    """How many images there are, and onnxruntime over all of them, decoded before."""
+def build_plain_loops(model: Path, recording: Path) -> tuple[int, dict[str, Callable[[], object]]]:
+    """Decode all images; return their number, and functions that run onnxruntime on all of them."""
     found = read(recording, "/*/camera/image")
     images = np.stack([decode(one.message.data, str(one.time_ns)) for one in found])
     options = onnxruntime.SessionOptions()
@@ -58,10 +59,10 @@ def plain_loops(model: Path, recording: Path) -> tuple[int, dict[str, Callable[[
 
 
 def measure(folder: Path, rounds: int) -> list[dict[str, Any]]:
-    """Measure each backend: milliseconds of CPU an image, and their ratio to the plain loop's."""
+    """Return a row for each backend: CPU milliseconds per image, and ratios to the plain loop."""
     model, recording = resolve_model_path(Path("dmrl-nano")), folder / "flight.mcap"
     fly.run(recording, fly.Settings(2, DURATION_S, camera=True, camera_rate_hz=5.0, seed=1))
-    count, work = plain_loops(model, recording)
+    count, work = build_plain_loops(model, recording)
     for backend in ("onnx", "torch"):
         out, how = folder / f"{backend}.mcap", predict.Settings(backend=backend)
         work[f"dmrl predict --backend {backend}"] = partial(predict.run, model, recording, out, how)
@@ -71,7 +72,7 @@ def measure(folder: Path, rounds: int) -> list[dict[str, Any]]:
             begun = [clock() for clock in CLOCKS]
             run()
             took = tuple(clock() - at for clock, at in zip(CLOCKS, begun, strict=True))
-            if number:  # the first round loads packages
+            if number:  # the first round is a warm-up
                 spent[name].append(took)
             for path in folder.glob("*.mcap"):
                 if path != recording:
@@ -92,7 +93,7 @@ def measure(folder: Path, rounds: int) -> list[dict[str, Any]]:
 
 
 def main() -> None:
-    """Measure and print."""
+    """Print a line for each backend."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--json", type=Path)

@@ -1,12 +1,13 @@
-"""How well figures of flights that a network did not fly rank the seconds that it holds a leader.
+"""Test how well offline figures of a network predict how long it keeps a leader in view.
 
     python benchmarks/bench_ranking.py FOLDER NETWORK... [--places 16] [--first 0] [--each]
 
-Every network flies `fly_follow` in every place over Blender's images: recipe's values, seed and
-place equal. An ideal eye flies in the same places with another seed, so along another path. Each
-network then runs on the images of those flights, and figures of `dmrl evaluate` are set beside the
-seconds held in its own: Spearman's correlation over all pairs of place and network, and the mean
-over places of that between networks. Recordings that FOLDER holds are not made again.
+Every network flies `fly_follow` with Blender's images in every place; the number of the place is
+also the seed. An ideal detector flies in the same places with another seed, so along another path.
+Each network then processes the images of those flights. The figures that `dmrl evaluate` computes
+there are compared with the seconds that the network held its leader in its own flights. Prints
+Spearman's correlation over all pairs of place and network, and the mean over places of the
+correlation between networks. Recordings in FOLDER are reused.
 """
 
 import argparse
@@ -25,12 +26,12 @@ from dmrl.simulation.flight_recording import FlySettings, record_flight
 from dmrl.terminal.tables import print_table
 
 OTHER_SEED = 1000
-"""Added to the number of a place for the seed of the flight to rank on."""
+"""Added to the number of a place to get the seed of the ideal detector's flight."""
 FIGURES = ("loop_s", "recall", "false_per_image", "longest_silence_s")
 
 
 def fly(out: Path, place: int, seed: int, eye: Path) -> Path:
-    """Return the recording of a flight in a place; fly it if there is none."""
+    """Fly in a place, unless the recording exists; return its path."""
     recipe = recipes.load("fly_follow", "fly", FlySettings)
     if not out.exists():
         record_flight(out, replace(recipe, eye=eye, seed=seed, place=place))
@@ -38,13 +39,13 @@ def fly(out: Path, place: int, seed: int, eye: Path) -> Path:
 
 
 def measure(recording: Path) -> dict[str, float]:
-    """Return the figures over time of a follower and its leader."""
+    """Return the flight figures of a follower and its leader."""
     figures = compute_flight_figures(judge(recording)[0])
     return {name: np.nan if value is None else value for name, value in figures.items()}
 
 
 def compare(folder: Path, network: Path, place: int) -> dict[str, float]:
-    """Return seconds held in a network's own flight, and its figures on the ideal eye's."""
+    """Return the seconds held in a network's own flight, and its figures on the ideal flight."""
     name = f"{network.stem}-{network.parent.name}" if network.exists() else network.name
     flown = measure(fly(folder / f"{name}-{place}.mcap", place, place, network))
     other = fly(folder / f"ideal-{place}.mcap", place, OTHER_SEED + place, Path("ideal"))
@@ -59,7 +60,7 @@ def compare(folder: Path, network: Path, place: int) -> dict[str, float]:
 
 
 def rank(figure: Array, held_s: Array) -> tuple[float, float]:
-    """Return the correlation over all pairs, and the mean of that between networks in a place."""
+    """Return the correlation over all pairs, and the mean over places of that between networks."""
     known = np.isfinite(figure)
     each = [
         spearmanr(*pair).statistic

@@ -1,10 +1,10 @@
-"""Labels from the odometry of real flights: pairs of NanoBench's, with simulated ranges.
+"""Evaluate labels from the odometry of real flights of NanoBench with simulated ranges.
 
 Run as ``python benchmarks/bench_real_odometry.py FOLDER [--seed 0] [--pairs 1,4 ...]``. FOLDER
-holds NanoBench's CSV files (arXiv 2603.09908), one Crazyflie each with its own estimate and Vicon.
-Two files are one pair: the second is turned and put one to two and a half metres beside the first,
-and both range to each other with calibrated noise. In every fourth pair the second robot crashes
-four seconds before the end: it lies still, and its estimate runs away.
+holds the CSV files of NanoBench (arXiv 2603.09908). Each has one Crazyflie with its own state
+estimate and Vicon. Two files make a pair: the second flight is turned and moved to 1 to 2.5 m
+beside the first, and both robots measure ranges with calibrated noise. In every fourth pair the
+second robot crashes four seconds before the end: it lies still, and its estimate diverges.
 """
 
 import argparse
@@ -14,7 +14,7 @@ from itertools import combinations
 from pathlib import Path
 
 import numpy as np
-from bench_label_faults import times
+from bench_label_faults import list_times
 
 from dmrl.estimation.flight.pairs import estimate_pairs
 from dmrl.estimation.model.gate import GATE_M
@@ -36,9 +36,9 @@ from dmrl.samples.sample import Columns
 
 NOISE_OF_RANGES = NOISE["calibrated"]
 CRASH_S, EVERY = 4.0, 4
-"""How long before the end a robot crashes, and in which pairs: every fourth."""
+"""Time of a crash before the end of the flight, seconds; every fourth pair has one."""
 RUNAWAY_MPS, RUNAWAY_RADPS, RAMP_S = 9.0, 12.0, 1.0
-"""What its estimate then comes to, and how soon."""
+"""Errors of velocity and yaw rate after a crash, and the time to reach them."""
 NEAR_M, FAR_M = 1.0, 2.5
 AIRBORNE_M = 0.15
 """A flight begins and ends where the robot passes this height."""
@@ -46,18 +46,18 @@ AIRBORNE_M = 0.15
 
 @dataclass(frozen=True, slots=True)
 class Flown:
-    """One robot's flight, N samples.
+    """The flight of one robot, N samples.
 
     Parameters
     ----------
     time_s
-        (N,) from the start of the flight.
+        (N,) times since the start of the flight.
     log
-        What the robot says of itself.
+        Attitude, velocity and height estimated on board.
     place_m
-        (N, 3) where it was.
+        (N, 3) true positions in the world frame.
     yaw_rad
-        (N,) where it looked.
+        (N,) true yaw, without jumps by a full turn.
     """
 
     time_s: Array
@@ -67,7 +67,7 @@ class Flown:
 
 
 def read(path: Path) -> Flown:
-    """Read a flight from a file, cropped to the time in the air."""
+    """Read a flight from a file; keep only the time in the air."""
     series = {s.topic: s for s in mapped_csv.load_content(path, Options(robot="cf")).series}
     pose = series["/cf/pose/truth"]
     place, turn = pose.fields["pose"]["position"], pose.fields["pose"]["orientation"]
@@ -77,22 +77,22 @@ def read(path: Path) -> Flown:
     up = pose.time_ns[place_m[:, 2] > AIRBORNE_M]
     at = (pose.time_ns >= up[0]) & (pose.time_ns <= up[-1])
 
-    def sensed(topic: str, *names: str) -> tuple[Array, Array]:
+    def crop_series(topic: str, *names: str) -> tuple[Array, Array]:
         one: Columns = series[topic]
         inside = (one.time_ns >= up[0]) & (one.time_ns <= up[-1])
         values = np.column_stack([np.asarray(one.fields[name], float) for name in names])
         return (one.time_ns[inside] - up[0]) * 1e-9, values[inside]
 
     log = RobotLog(
-        sensed("/cf/attitude", "roll_rad", "pitch_rad", "yaw_rate_radps"),
-        sensed("/cf/velocity", "vx_mps", "vy_mps"),
-        sensed("/cf/height", "height_m"),
+        crop_series("/cf/attitude", "roll_rad", "pitch_rad", "yaw_rate_radps"),
+        crop_series("/cf/velocity", "vx_mps", "vy_mps"),
+        crop_series("/cf/height", "height_m"),
     )
     return Flown((pose.time_ns[at] - up[0]) * 1e-9, log, place_m[at], yaw[at])
 
 
-def crashed(flown: Flown, at_s: float) -> Flown:
-    """Add a crash to a flight: the drone lies still from then on, and its estimate diverges."""
+def add_crash(flown: Flown, at_s: float) -> Flown:
+    """Add a crash to a flight: from then on the drone lies still and its estimate diverges."""
     share = np.clip((flown.time_s - at_s) / RAMP_S, 0.0, 1.0)
     down = flown.time_s >= at_s
     place, yaw = flown.place_m.copy(), flown.yaw_rad.copy()
@@ -108,8 +108,8 @@ def crashed(flown: Flown, at_s: float) -> Flown:
     return Flown(flown.time_s, log, place, yaw)
 
 
-def beside(flown: Flown, rng: np.random.Generator) -> Flown:
-    """Turn a flight about its middle and move it aside."""
+def move_aside(flown: Flown, rng: np.random.Generator) -> Flown:
+    """Turn a flight about its mean position and move it 1 to 2.5 m from the origin."""
     turn, bearing = rng.uniform(-np.pi, np.pi, 2)
     middle = flown.place_m[:, :2].mean(axis=0)
     away = rng.uniform(NEAR_M, FAR_M) * np.array([np.cos(bearing), np.sin(bearing)])
@@ -119,12 +119,12 @@ def beside(flown: Flown, rng: np.random.Generator) -> Flown:
 
 
 def _at(flown: Flown, time_s: Array) -> Array:
-    """(N, 3) places."""
+    """Return (N, 3) true positions at some times."""
     return np.stack([np.interp(time_s, flown.time_s, c) for c in flown.place_m.T], axis=1)
 
 
-def measured(one: Flown, other: Flown, rng: np.random.Generator) -> tuple[Array, Array]:
-    """Simulate times and ranges of both directions, in order."""
+def simulate_ranges(one: Flown, other: Flown, rng: np.random.Generator) -> tuple[Array, Array]:
+    """Return times and ranges of both directions, in order of time."""
     noise, (bias_m, scale) = NOISE_OF_RANGES, draw_pair_errors(rng, NOISE_OF_RANGES)
     end_s = min(one.time_s[-1], other.time_s[-1])
     time_s = np.sort(rng.uniform(0.0, end_s, int(2 * noise.ranging_rate_hz * end_s)))
@@ -136,44 +136,45 @@ def measured(one: Flown, other: Flown, rng: np.random.Generator) -> tuple[Array,
     return time_s, np.maximum(scale * distance + error, 0.01)
 
 
-def pair_of(one: Flown, other: Flown, rng: np.random.Generator) -> Pair:
-    """Build the input of the estimators."""
+def build_pair(one: Flown, other: Flown, rng: np.random.Generator) -> Pair:
+    """Return the logs and simulated ranges of two robots as input of the estimators."""
     start_s = max(flown.log.start_s for flown in (one, other))
     end_s = min(flown.log.end_s for flown in (one, other))
     grid_s = start_s + np.arange(int((end_s - start_s) * GRID_RATE_HZ) + 1) / GRID_RATE_HZ
-    time_s, range_m = measured(one, other, rng)
+    time_s, range_m = simulate_ranges(one, other, rng)
     good = usable_ranges(time_s, range_m) & (time_s >= grid_s[0]) & (time_s <= grid_s[-1])
     return Pair(
         grid_s, one.log.to_track(grid_s), other.log.to_track(grid_s), time_s[good], range_m[good]
     )
 
 
-def truth(one: Flown, other: Flown, time_s: Array) -> Array:
-    """(N, 2) places of the other in the horizontal frame of the one."""
+def compute_truth(one: Flown, other: Flown, time_s: Array) -> Array:
+    """Return (N, 2) positions of the other robot in the horizontal frame of the first, metres."""
     yaw = np.interp(time_s, one.time_s, one.yaw_rad)
     apart = (_at(other, time_s) - _at(one, time_s))[:, :2]
     return np.asarray((rotation_matrix(-yaw) @ apart[..., None])[..., 0])
 
 
 def main() -> None:
-    """Print a row per pair, and the medians."""
+    """Print a row per pair, and a summary."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--pairs", nargs="*", help="such as 0,3; without it, all")
+    parser.add_argument("--pairs", nargs="*", help="for example 0,3; default: all")
     given = parser.parse_args()
     flights = [read(path) for path in sorted(given.folder.glob("*.csv"))]
     wanted = [tuple(map(int, text.split(","))) for text in given.pairs or ()]
-    print(" pair  crash   RMSE  ellipse  kept     bad  cpu-s   of both directions")
+    print("Figures of both directions together")
+    print(" pair  crash   RMSE  ellipse  kept     bad  cpu-s")
     rows = []
     for number, pair in enumerate(combinations(range(len(flights)), 2)):
         if wanted and pair not in wanted:
             continue
         rng = np.random.default_rng([given.seed, number])
-        one, other = flights[pair[0]], beside(flights[pair[1]], rng)
+        one, other = flights[pair[0]], move_aside(flights[pair[1]], rng)
         crash = number % EVERY == EVERY - 1
         if crash:
-            other = crashed(other, min(one.time_s[-1], other.time_s[-1]) - CRASH_S)
+            other = add_crash(other, min(one.time_s[-1], other.time_s[-1]) - CRASH_S)
         rows.append(_row(one, other, rng))
         rmse, inside, kept, bad, spent = rows[-1]
         print(
@@ -183,22 +184,22 @@ def main() -> None:
         )
     table = np.array(rows)
     print(
-        f"median RMSE {np.median(table[:, 0]):.3f} m, least in ellipse {table[:, 1].min():.1%}, "
-        f"least kept {table[:, 2].min():.0%}, most bad {table[:, 3].max():.2%}"
+        f"median RMSE {np.median(table[:, 0]):.3f} m, minimum in ellipse {table[:, 1].min():.1%}, "
+        f"minimum kept {table[:, 2].min():.0%}, maximum bad {table[:, 3].max():.2%}"
     )
 
 
 def _row(one: Flown, other: Flown, rng: np.random.Generator) -> tuple[float, ...]:
-    """RMSE, share in the ellipse, share kept, bad of kept, CPU seconds."""
-    pair = pair_of(one, other, rng)
+    """Solve a pair; return RMSE, share in the ellipse, share kept, bad of kept, CPU seconds."""
+    pair = build_pair(one, other, rng)
     begun = time.process_time()
     (both,) = estimate_pairs([pair])
     spent_s = time.process_time() - begun
-    time_s, ways = times(pair), ((one, other), (other, one))
+    time_s, ways = list_times(pair), ((one, other), (other, one))
     seen = []
     for estimate, names in zip(both, ways, strict=True):
         xy, spread, status = estimate.interpolate_at(time_s)
-        true = truth(*names, time_s)
+        true = compute_truth(*names, time_s)
         distance = np.linalg.norm(true, axis=1)
         seen.append(
             EvaluatedPositions(time_s - time_s[0], xy - true, spread, distance, status == OK)

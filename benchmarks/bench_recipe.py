@@ -1,13 +1,13 @@
-"""What each ingredient of a training recipe gives, on images held out of the training split.
+"""Ablation of a training recipe, evaluated on held-out images of the training split.
 
     python benchmarks/bench_recipe.py DATASET [--recipe published_best] [--epochs 12]
         [--seeds 1] [--first-seed 0] [--only "no paste" ...] [--json OUT.json]
 
-Every row is the recipe with one thing taken out or put in its place, trained anew and judged
-on the same images, one in ten of the training split. The test split is never opened. Short
-trainings tell what helps early: an ingredient against overfitting shows its worth later. The last
-column is the CPU time after which a row is as often within 20 px as the published recipe, in its
-own 15 epochs, at its end; that row is needed for it.
+Every row is the recipe with one setting removed or replaced, trained anew and evaluated on the same
+images: one in ten of the training split. The test split is not used. Short trainings show what
+helps early; regularisation may pay off only later. The last column is the CPU time after which a
+row reaches the share within 20 px of the published recipe at the end of its own 15 epochs. It needs
+the row of that recipe.
 """
 
 import argparse
@@ -70,17 +70,17 @@ VARIANTS: dict[str, dict[str, Any]] = {
 HELD_OUT = 0.1
 
 
-def rows(
+def iter_rows(
     dataset: Path, name: str, epochs: int, seeds: range, only: list[str]
 ) -> Iterator[dict[str, Any]]:
-    """One row per variant: mean and spread over the seeds of each figure."""
+    """Train every variant; yield the mean and standard deviation over seeds of each figure."""
     for title in only or VARIANTS:
-        settings = shortened(title, name, epochs)
+        settings = build_settings(title, name, epochs)
         begun = time.process_time()
         with tempfile.TemporaryDirectory() as folder:
             runs, teacher = Path(folder), None
             if title == TAUGHT:
-                # One for all seeds. The row's CPU time includes its own.
+                # All seeds share one teacher. The CPU time of the row includes its training.
                 teacher = runs / "teacher"
                 run(dataset, teacher, replace(settings, architecture=TEACHER))
             for seed in seeds:
@@ -104,8 +104,8 @@ def rows(
         yield row
 
 
-def shortened(title: str, name: str, epochs: int) -> Settings:
-    """Return the settings of a row; the end of the training has the same share as in the recipe."""
+def build_settings(title: str, name: str, epochs: int) -> Settings:
+    """Return the settings of a row; its final phases are shortened like the whole training."""
     if title == PUBLISHED:
         settings = recipe.load("locanet", "train", Settings)
         return replace(settings, epochs=PUBLISHED_EPOCHS, validation_share=HELD_OUT)
@@ -114,13 +114,13 @@ def shortened(title: str, name: str, epochs: int) -> Settings:
         name: round(epochs * getattr(settings, name) / settings.epochs)
         for name in ("plain_epochs", "frozen_norm_epochs", "ema_steps")
     }
-    # One process: the CPU time is that of this one.
+    # One process only, since the CPU time of this process is measured.
     short = {"epochs": epochs, "validation_share": HELD_OUT, "processes": 1, **parts}
     return replace(settings, **{**short, **VARIANTS[title]})
 
 
-def reached_s(row: dict[str, Any], share: float) -> str:
-    """CPU seconds after which a row is this good, to whole epochs; a dash: never."""
+def format_time_to_reach(row: dict[str, Any], share: float) -> str:
+    """Return the CPU seconds of the epochs after which a row reaches a share; "-" if never."""
     good = np.flatnonzero(np.array(row["within_20_px_by_epoch"]) >= share)
     return f"{(good[0] + 1) * row['cpu_s'] / row['epochs']:.0f}" if len(good) else "-"
 
@@ -138,7 +138,7 @@ def main() -> None:
     args = parser.parse_args()
     found = []
     seeds = range(args.first_seed, args.first_seed + args.seeds)
-    for row in rows(args.dataset, args.recipe, args.epochs, seeds, args.only):
+    for row in iter_rows(args.dataset, args.recipe, args.epochs, seeds, args.only):
         found.append(row)
         if args.json:
             args.json.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
@@ -146,20 +146,20 @@ def main() -> None:
     shown = [
         (
             row["variant"],
-            *(_words(row, figure) for figure in VALIDATION_METRICS),
+            *(_format(row, figure) for figure in VALIDATION_METRICS),
             round(row["cpu_s"] / row["epochs"], 1),
-            reached_s(row, goals[0]) if goals else "-",
+            format_time_to_reach(row, goals[0]) if goals else "-",
         )
         for row in found
     ]
     columns = (
         *("variant", "within 20 px", "median, px", "depth MAE, m", "AP at 16 px"),
-        *("cpu-s an epoch", "cpu-s to the published"),
+        *("cpu-s per epoch", "cpu-s to reach the published"),
     )
     print_table(f"{args.epochs} epochs, {args.seeds} seeds", columns, shown)
 
 
-def _words(row: dict[str, Any], figure: str) -> str:
+def _format(row: dict[str, Any], figure: str) -> str:
     spread = row[f"{figure}_std"]
     return f"{row[figure]:.3f}" + ("" if math.isnan(spread) else f" +- {spread:.3f}")
 

@@ -1,9 +1,10 @@
-"""Recordings written, read and copied: dmrl beside mcap's, foxglove's and rerun's own packages.
+"""Compare dmrl with mcap, foxglove-sdk and rerun for writing, reading and copying recordings.
 
 Run as ``python benchmarks/bench_recording.py [--rounds 5] [--json FILE]``, after
-``pip install --group bench``. Everyone does the same work in one process, in turn, round after
-round; figures are medians of CPU time, all threads counted, and ratios are of the same round. The
-recordings are flights of `dmrl fly`: two robots with cameras on 17 topics, ten without on 211.
+``pip install --group bench``. All packages do the same work in one process, in turns. Figures are
+medians over rounds of the CPU time of all threads; ratios are taken within each round. The
+recordings are flights of `dmrl fly`: two robots with cameras (17 topics) and ten robots without
+(211 topics).
 """
 
 import argparse
@@ -35,8 +36,8 @@ MESSAGES = 200_000
 Work = Callable[[Path, Path], object]
 
 
-def flights(folder: Path) -> dict[str, Path]:
-    """Make the recordings that are read and copied."""
+def make_flights(folder: Path) -> dict[str, Path]:
+    """Simulate the recordings that are read and copied, unless they exist; return their paths."""
     found = {"17 topics, cameras": folder / "pair.mcap", "211 topics": folder / "swarm.mcap"}
     pair = fly.Settings(2, 50.0, camera=True, camera_rate_hz=5.0, seed=1)
     for path, settings in zip(found.values(), (pair, fly.Settings(10, 20.0, seed=1)), strict=True):
@@ -49,8 +50,8 @@ ROLL, PITCH, YAW = np.random.default_rng(0).normal(size=(3, MESSAGES))
 TIMES = np.arange(MESSAGES) * 10_000_000
 
 
-def messages() -> Any:
-    """Time and bytes of each message, built one at a time as a driver would."""
+def iter_messages() -> Any:
+    """Yield time and message, built one at a time as by a driver."""
     attitude = message_class("Attitude")
     rows = zip(TIMES.tolist(), ROLL.tolist(), PITCH.tolist(), YAW.tolist(), strict=True)
     for time_ns, roll, pitch, yaw in rows:
@@ -58,14 +59,14 @@ def messages() -> Any:
 
 
 def write_dmrl(_: Path, out: Path) -> None:
-    """One message after another."""
+    """Write the messages one by one."""
     with RecordingWriter(out, MADE) as sink:
-        for time_ns, made in messages():
+        for time_ns, made in iter_messages():
             sink.write(time_ns, TOPIC, made)
 
 
 def write_columns(_: Path, out: Path) -> None:
-    """Write the same recording from arrays."""
+    """Write the same recording from arrays, 10,000 messages at a time."""
     fields = {"roll_rad": ROLL, "pitch_rad": PITCH, "yaw_rate_radps": YAW}
     with RecordingWriter(out, MADE) as sink:
         for part in np.array_split(np.arange(MESSAGES), MESSAGES // 10_000):
@@ -74,61 +75,61 @@ def write_columns(_: Path, out: Path) -> None:
 
 
 def write_mcap(_: Path, out: Path) -> None:
-    """By mcap's own writer."""
+    """Write the messages with mcap's own writer."""
     with out.open("wb") as stream:
         writer = Writer(stream, chunk_size=256 * 1024)
         writer.start()
         schema = writer.register_schema(KIND, "protobuf", serialize_schema("Attitude"))
         channel = writer.register_channel(TOPIC, "protobuf", schema)
-        for time_ns, made in messages():
+        for time_ns, made in iter_messages():
             writer.add_message(channel, time_ns, made.SerializeToString(), time_ns)
         writer.finish()
 
 
 def write_foxglove(_: Path, out: Path) -> None:
-    """By foxglove-sdk, which is written in Rust."""
+    """Write the messages with foxglove-sdk, which is written in Rust."""
     context = foxglove.Context()
     schema = FoxgloveSchema(name=KIND, encoding="protobuf", data=serialize_schema("Attitude"))
     with foxglove.open_mcap(out, context=context):
         channel = FoxgloveChannel(
             TOPIC, schema=schema, message_encoding="protobuf", context=context
         )
-        for time_ns, made in messages():
+        for time_ns, made in iter_messages():
             channel.log(made.SerializeToString(), log_time=time_ns)
 
 
 def build_only(_: Path, out: Path) -> None:
-    """Build and serialise alone, as every writer of single messages does."""
+    """Build and serialise the messages without writing them; every writer has this cost."""
     out.write_bytes(b"")
-    for _time_ns, made in messages():
+    for _time_ns, made in iter_messages():
         made.SerializeToString()
 
 
 def read_dmrl(path: Path, _: Path) -> int:
-    """One topic to Arrow columns."""
+    """Read one topic as Arrow columns; return the number of messages."""
     return sum(batch.num_rows for batch in iter_columns(path, TOPIC))
 
 
 def read_mcap(path: Path, _: Path) -> int:
-    """One topic to Python objects."""
+    """Read one topic as Python objects; return the number of messages."""
     with path.open("rb") as stream:
         reader = make_reader(stream, decoder_factories=[DecoderFactory()])
         return sum(1 for _ in reader.iter_decoded_messages(topics=[TOPIC]))
 
 
 def read_rerun(path: Path, _: Path) -> int:
-    """One topic to rerun's chunks of Arrow."""
+    """Read one topic as rerun's Arrow chunks; return the number of rows."""
     reader = McapReader(path, include_topic_regex=[f"^{TOPIC}$"])
     return sum(chunk.num_rows for chunk in reader.stream())
 
 
 def copy_dmrl(path: Path, out: Path) -> None:
-    """All of a recording, verified, as a stage does that adds to it."""
+    """Verify and copy a whole recording, as by a stage that adds topics to it."""
     rewrite(path, out, MADE, without=())
 
 
 def copy_mcap(path: Path, out: Path) -> None:
-    """Copy a recording by mcap's reader and writer."""
+    """Copy a recording with mcap's reader and writer."""
     with path.open("rb") as source, out.open("wb") as sink:
         writer, numbers = Writer(sink, chunk_size=256 * 1024), dict[int, int]()
         writer.start()
@@ -143,8 +144,8 @@ def copy_mcap(path: Path, out: Path) -> None:
         writer.finish()
 
 
-def paired(work: dict[str, Work], path: Path, out: Path, rounds: int) -> dict[str, list[float]]:
-    """CPU seconds of everyone, round by round."""
+def run_rounds(work: dict[str, Work], path: Path, out: Path, rounds: int) -> dict[str, list[float]]:
+    """Run all programs in turns; return the CPU seconds of each by round."""
     spent: dict[str, list[float]] = {name: [] for name in work}
     for _ in range(rounds):
         for name, run in work.items():
@@ -155,8 +156,10 @@ def paired(work: dict[str, Work], path: Path, out: Path, rounds: int) -> dict[st
     return spent
 
 
-def rows(spent: dict[str, list[float]], what: str, count: int, size: int) -> list[dict[str, Any]]:
-    """Return a row for each program: microseconds a message, and their ratio to dmrl's."""
+def build_rows(
+    spent: dict[str, list[float]], what: str, count: int, size: int
+) -> list[dict[str, Any]]:
+    """Return a row for each program: microseconds per message, and their ratio to dmrl's."""
     ours = next(iter(spent.values()))
     return [
         {
@@ -171,7 +174,7 @@ def rows(spent: dict[str, list[float]], what: str, count: int, size: int) -> lis
 
 
 def measure(folder: Path, rounds: int) -> list[dict[str, Any]]:
-    """All rows of the table."""
+    """Measure everything; return all rows of the table."""
     out, found = folder / "out.mcap", list[dict[str, Any]]()
     writers: dict[str, Work] = {
         "dmrl, columns": write_columns,
@@ -181,23 +184,23 @@ def measure(folder: Path, rounds: int) -> list[dict[str, Any]]:
         "foxglove-sdk": write_foxglove,
     }
     readers = {"dmrl": read_dmrl, "mcap": read_mcap, "rerun": read_rerun}
-    spent = paired(writers, folder, out, rounds)
-    found += rows(spent, "write attitudes", MESSAGES, 58 * MESSAGES)
-    for name, path in flights(folder).items():
+    spent = run_rounds(writers, folder, out, rounds)
+    found += build_rows(spent, "write attitudes", MESSAGES, 58 * MESSAGES)
+    for name, path in make_flights(folder).items():
         held, size = read_summary(path), path.stat().st_size
         assert read_dmrl(path, out) == read_mcap(path, out) == held.topics[TOPIC].count
-        spent = paired(readers, path, out, rounds)
-        found += rows(spent, f"read a topic of {name}", held.topics[TOPIC].count, size)
-        spent = paired({"dmrl": copy_dmrl, "mcap": copy_mcap}, path, out, rounds)
-        found += rows(spent, f"copy {name}", held.count, size)
+        spent = run_rounds(readers, path, out, rounds)
+        found += build_rows(spent, f"read a topic of {name}", held.topics[TOPIC].count, size)
+        spent = run_rounds({"dmrl": copy_dmrl, "mcap": copy_mcap}, path, out, rounds)
+        found += build_rows(spent, f"copy {name}", held.count, size)
     return found
 
 
 def main() -> None:
-    """Measure and print."""
+    """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--rounds", type=int, default=5)
-    parser.add_argument("--folder", type=Path, help="where the recordings are made, and kept")
+    parser.add_argument("--folder", type=Path, help="folder of the recordings; default: temporary")
     parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as spare:

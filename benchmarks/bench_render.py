@@ -1,4 +1,4 @@
-"""Figures of dmrl render: reprojection, grain, cost against the published way, memory.
+"""Measure dmrl render: reprojection, noise, cost compared with the published method, memory.
 
     python benchmarks/bench_render.py reprojection [--images 500]
     python benchmarks/bench_render.py grain --images 24 --backgrounds DIR
@@ -6,7 +6,7 @@
     python benchmarks/bench_render.py memory [--images 3000]
     python benchmarks/bench_render.py parts --images 120 [--rounds 3]
 
-CPU seconds are those of all processes together, start-up included where not said otherwise.
+CPU seconds are sums over all processes, and include the start-up unless stated otherwise.
 """
 
 import argparse
@@ -24,7 +24,7 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from render_exactness import grain, grey, reprojection
+from render_exactness import build_grey_panorama, measure_noise, measure_reprojection
 from render_parts import measure_parts
 
 from dmrl.render_recording import read_render_camera, read_render_settings
@@ -36,7 +36,7 @@ from dmrl.terminal.progress import say
 PUBLISHED_WAY = Path(__file__).parent / "published_way.py"
 PUBLISHED = "the published way"
 SAMPLES, FEW = 16, 4
-MM_PER_UNIT = 0.002  # the published model, at twice life size as the authors rendered it
+M_PER_UNIT = 0.002  # of the published model, which the authors rendered at twice life size
 
 
 def _children_s() -> float:
@@ -49,10 +49,10 @@ def _own_s() -> float:
     return used.ru_utime + used.ru_stime
 
 
-def published_way(
+def measure_published_way(
     model: Path, backgrounds: Path, images: int, samples: int, *, lean: bool
 ) -> dict[str, float]:
-    """CPU seconds per image of the published way, start-up included, on our own scenes.
+    """Return the CPU seconds per image of the published method on dmrl's scenes, with start-up.
 
     Parameters
     ----------
@@ -61,11 +61,12 @@ def published_way(
     backgrounds
         Folder of photos.
     images
-        How many.
+        Number of images.
     samples
         Light paths per pixel.
     lean
-        2 bounces and a filter as wide as the pixel, as dmrl has them, in place of 12 and a wider.
+        Use dmrl's settings: 2 bounces and a filter of one pixel. Else 12 bounces and a wider
+        filter, as published.
     """
     settings = replace(read_render_settings("synthetic_paper"), images=images, robots_max=1)
     world = SceneSource(
@@ -73,7 +74,7 @@ def published_way(
         read_render_camera(settings),
         0.1,
         ("none",),
-        grey,
+        build_grey_panorama,
         None,
     )
     photos = sorted(backgrounds.glob("*.jpg"))
@@ -100,19 +101,19 @@ def published_way(
     return {"cpu_s_per_image": cpu_s / images, "images_per_s": images / wall_s}
 
 
-def ours(recipe: str, images: int, workers: int, **changes: object) -> dict[str, float]:
-    """CPU seconds per image of ``dmrl render``, start-up and recording included.
+def measure_ours(recipe: str, images: int, workers: int, **changes: object) -> dict[str, float]:
+    """Return the CPU seconds per image of ``dmrl render``, with start-up and recording.
 
     Parameters
     ----------
     recipe
         Name of a recipe.
     images
-        How many.
+        Number of images.
     workers
-        Blender processes.
+        Number of Blender processes.
     changes
-        Settings over the recipe's.
+        Settings that replace those of the recipe.
     """
     with tempfile.TemporaryDirectory() as folder:
         settings = read_render_settings(recipe, images=images, workers=workers, **changes)
@@ -127,13 +128,13 @@ def ours(recipe: str, images: int, workers: int, **changes: object) -> dict[str,
     }
 
 
-def memory(images: int) -> dict[str, float]:
-    """Resident memory of this process and the workers early and late in one run, MB.
+def measure_memory(images: int) -> dict[str, float]:
+    """Return the resident memory of this process and its workers early and late in a run, MB.
 
     Parameters
     ----------
     images
-        How many to render; the first and last thousand, or third, are compared.
+        Number of images to render; the first and the last third of the run are compared.
     """
     seen: list[float] = []
     stop = threading.Event()
@@ -145,7 +146,7 @@ def memory(images: int) -> dict[str, float]:
     thread = threading.Thread(target=watch)
     thread.start()
     try:
-        rates = ours("synthetic_paper", images, 0)
+        rates = measure_ours("synthetic_paper", images, 0)
     finally:
         stop.set()
         thread.join()
@@ -155,7 +156,7 @@ def memory(images: int) -> dict[str, float]:
 
 
 def _resident_mb() -> float:
-    """Memory of the benchmark and its children."""
+    """Return the resident memory of the benchmark and its children, MB."""
     own = os.getpid()
     total = 0
     for stat in Path("/proc").glob("[0-9]*/stat"):
@@ -164,63 +165,63 @@ def _resident_mb() -> float:
             if int(stat.parent.name) == own or int(fields[1]) == own:
                 total += int(fields[21])
         except (OSError, IndexError):
-            continue  # it has ended meanwhile
+            continue  # the process has ended in the meantime
     return total * os.sysconf("SC_PAGE_SIZE") / 1e6
 
 
 Way = tuple[Callable[[int], dict[str, float]], int]
-"""What a number of images costs, and how many to take."""
+"""A function that measures rendering a number of images, and that number."""
 
 
-def ways_of(model: Path | None, backgrounds: Path | None, images: int) -> dict[str, Way]:
-    """Return the published renderer, as published and lean, and ours; without a model only ours."""
+def build_ways(model: Path | None, backgrounds: Path | None, images: int) -> dict[str, Way]:
+    """Return ways to render by name: the published method, if there is a model, and dmrl."""
     one = {"backgrounds": backgrounds or Path("rooms"), "robots_max": 1}
     own: dict[str, Way] = {
         "ours, default model": (
-            lambda n: ours("synthetic_paper", n, 2, samples=SAMPLES, **one),
+            lambda n: measure_ours("synthetic_paper", n, 2, samples=SAMPLES, **one),
             images,
         ),
-        "synthetic_paper": (lambda n: ours("synthetic_paper", n, 2, **one), images),
-        "synthetic_large": (lambda n: ours("synthetic_large", n, 2, **one), images),
+        "synthetic_paper": (lambda n: measure_ours("synthetic_paper", n, 2, **one), images),
+        "synthetic_large": (lambda n: measure_ours("synthetic_large", n, 2, **one), images),
     }
     if model is None or backgrounds is None:
         return own
-    as_published = {"model": model, "scale": MM_PER_UNIT, "model_up": "y"}
-    theirs = partial(published_way, model, backgrounds, samples=SAMPLES)
+    as_published = {"model": model, "scale": M_PER_UNIT, "model_up": "y"}
+    theirs = partial(measure_published_way, model, backgrounds, samples=SAMPLES)
     return {
         PUBLISHED: (partial(theirs, lean=False), images // 10),
         f"{PUBLISHED}, 2 bounces and a box": (partial(theirs, lean=True), images // 10),
         "ours, published model": (
-            lambda n: ours("synthetic_paper", n, 2, samples=SAMPLES, **one, **as_published),
+            lambda n: measure_ours("synthetic_paper", n, 2, samples=SAMPLES, **one, **as_published),
             images,
         ),
         **own,
     }
 
 
-def speed(
+def compare_speed(
     model: Path | None, backgrounds: Path | None, images: int, rounds: int
 ) -> dict[str, object]:
-    """Measure the published renderer and ours, with its model and our own, in turns in one run.
+    """Time the published method and dmrl, with the published model and dmrl's, in turns.
 
-    The published way, twice, and the first two of ours take equal samples; what is called by a
-    recipe's name is as that recipe says.
+    The rows of the published method and those that start with "ours" have equal numbers of samples.
+    Rows with the name of a recipe use its settings.
 
-    Every way is timed with few and with many images; the difference is what an image costs
-    without the start. What else runs on the machine then disturbs all ways alike.
+    Each is timed with few and with many images. The difference gives the cost of an image without
+    the start-up. Because they take turns, other load on the machine slows all of them alike.
 
     Parameters
     ----------
     model
-        crazyflie-published.blend. None: without the published way.
+        crazyflie-published.blend. None: without the published method.
     backgrounds
-        Folder of photos; None: rooms made by code, and without the published way.
+        Folder of photos. None: generated rooms, and without the published method.
     images
-        How many of ours in a round; the published way gets a tenth.
+        Number of images of dmrl per round; the published method renders a tenth of them.
     rounds
-        How often; the least and the median are told.
+        Number of rounds; the result has minimum, median and maximum.
     """
-    ways = ways_of(model, backgrounds, images)
+    ways = build_ways(model, backgrounds, images)
     found: dict[str, list[dict[str, float]]] = {name: [] for name in ways}
     for _ in range(rounds):
         for name, (way, many) in ways.items():
@@ -248,7 +249,7 @@ def speed(
 
 
 def main() -> None:
-    """Print the figures that were asked for, as JSON."""
+    """Print the requested figures as JSON."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("what", choices=("reprojection", "grain", "speed", "memory", "parts"))
     parser.add_argument("--images", type=int, default=500)
@@ -258,18 +259,18 @@ def main() -> None:
     parser.add_argument("--json", type=Path)
     asked = parser.parse_args()
     if asked.what == "reprojection":
-        result: object = {p: reprojection(p, asked.images) for p in ("published", "himax")}
+        result: object = {p: measure_reprojection(p, asked.images) for p in ("published", "himax")}
     elif asked.what == "memory":
-        result = memory(asked.images)
+        result = measure_memory(asked.images)
     elif asked.what == "parts":
         result = measure_parts("synthetic_paper", asked.images, asked.rounds)
     elif asked.what == "speed":
-        result = speed(asked.model, asked.backgrounds, asked.images, asked.rounds)
+        result = compare_speed(asked.model, asked.backgrounds, asked.images, asked.rounds)
     elif asked.backgrounds is None:
         sys.exit(f"{asked.what} needs --backgrounds DIR")
     else:
         recipes = ("synthetic_paper", "synthetic_large")
-        result = {r: grain(r, asked.images, asked.backgrounds) for r in recipes}
+        result = {r: measure_noise(r, asked.images, asked.backgrounds) for r in recipes}
     text = json.dumps(result, indent=2)
     print(text)
     if asked.json:

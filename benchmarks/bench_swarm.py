@@ -1,7 +1,8 @@
-"""All robots in one solve against pair by pair: error, honesty, what is kept, and the cost.
+"""Compare one solve of all robots with pairwise solves: error, consistency, share kept and cost.
 
 Run as ``python benchmarks/bench_swarm.py [--robots 3] [--noise realistic] [--only random]
-[--flights 3]``. Flights of 100 s; both directions of every pair. Errors and ellipse after 20 s.
+[--flights 3]``. The flights last 100 s; both directions of every pair are evaluated. Errors and
+the share inside the 95 % ellipse count after 20 s.
 """
 
 import argparse
@@ -9,7 +10,7 @@ import time
 from itertools import combinations
 
 import numpy as np
-from bench_label_faults import judged, pair_of, times
+from bench_label_faults import build_pair, evaluate, list_times
 
 from dmrl.estimation.flight.pairs import estimate_pairs
 from dmrl.estimation.flight.swarm import estimate_swarm
@@ -29,11 +30,11 @@ def main() -> None:
     parser.add_argument("--flights", type=int, default=3)
     parser.add_argument("--first-seed", type=int, default=0)
     given = parser.parse_args()
-    print(f"{given.robots} robots, {given.noise}, {given.only}; RMSE: median and largest of pairs")
-    print("  seed method   RMSE   most  ellipse  least   kept     bad   worst   cpu-s")
+    print(f"{given.robots} robots, {given.noise}, {given.only}; RMSE: median and maximum of pairs")
+    print("  seed method   RMSE    max  ellipse    min   kept     bad   worst   cpu-s")
     for seed in range(given.first_seed, given.first_seed + given.flights):
         flight = simulate(Scenario(given.robots, 100.0, given.only), NOISE[given.noise], seed)
-        pairs = {names: pair_of(flight, *names) for names in combinations(flight.robots, 2)}
+        pairs = {names: build_pair(flight, *names) for names in combinations(flight.robots, 2)}
         begun = time.process_time()
         both = estimate_pairs(list(pairs.values()))
         found = {n: e[0] for n, e in zip(pairs, both, strict=True)}
@@ -47,9 +48,9 @@ def main() -> None:
         ):
             rows = []
             for names, estimate in estimates.items():
-                time_s = times(pairs[names] if names in pairs else pairs[names[::-1]])
+                time_s = list_times(pairs[names] if names in pairs else pairs[names[::-1]])
                 xy, spread, status = estimate.interpolate_at(time_s)
-                seen = judged(flight, *names, time_s, (xy, spread, status == OK))
+                seen = evaluate(flight, *names, time_s, (xy, spread, status == OK))
                 rows.append(compute_figures(seen, SETTLE_S))
             every = combine_figures(rows)
             worst = np.nanmax([1 - row.precision for row in rows] or [np.nan])

@@ -1,10 +1,10 @@
-"""Loading, augmentation and training steps: images per cpu-second, and what waits for what.
+"""Measure the images per CPU second of loading, augmentation and training steps.
 
     python benchmarks/bench_training.py [IMAGES] [--recipe published_best] [--threads 1]
 
-The ways of training take turns, a few steps each, so that other load on the machine falls on
-all: dmrl's network on fresh augmented batches and on one batch already in memory, that network
-with torch's own backward pass of depthwise layers, in float32, and the published network.
+The variants take turns, a few steps each, so that other load on the machine slows all of them
+alike: dmrl's network on newly augmented batches and on one batch in memory, that network with
+torch's own backward pass of depthwise layers, in float32, and the published network.
 """
 
 import argparse
@@ -40,7 +40,7 @@ STEPS, TURNS = 3, 8
 
 
 def build(folder: Path, count: int) -> ExampleSet:
-    """Make a dataset of smooth images with one peer each, and open it as training does."""
+    """Make a dataset of smooth images with one peer each, and open it like the training."""
     ramp = np.linspace(0, 200, WIDTH_PX)[None, :, None] + np.zeros((HEIGHT_PX, 1, 3))
     with RecordingWriter(folder / "flight.mcap", Provenance("bench")) as sink:
         for k in range(count):
@@ -55,8 +55,8 @@ def build(folder: Path, count: int) -> ExampleSet:
     return build_examples(open_dataset(folder / "dataset").split("train"))
 
 
-def endless(examples: ExampleSet, settings: TrainConfig) -> Iterator[Batch]:
-    """Whole augmented batches, epoch after epoch."""
+def iter_batches(examples: ExampleSet, settings: TrainConfig) -> Iterator[Batch]:
+    """Yield full augmented batches without end, epoch after epoch."""
     augmenter, size, epoch = Augmenter(examples, settings.augmentation(0), seed=0), 0, 0
     size = settings.batch_size
     while True:
@@ -67,13 +67,13 @@ def endless(examples: ExampleSet, settings: TrainConfig) -> Iterator[Batch]:
         epoch += 1
 
 
-def ways(examples: ExampleSet, settings: TrainConfig) -> dict[str, Callable[[], object]]:
-    """Return functions that do one step each, by name."""
-    fresh = endless(examples, settings)
+def build_steps(examples: ExampleSet, settings: TrainConfig) -> dict[str, Callable[[], object]]:
+    """Return a function for each variant that does one step, by name."""
+    fresh = iter_batches(examples, settings)
     ready = next(fresh)
     chosen = epoch_indices(len(examples), seed=0, epoch=0)[: settings.batch_size]
 
-    def stepper(change: dict[str, object], batches: Iterator[Batch] | None = None) -> object:
+    def build_step(change: dict[str, object], batches: Iterator[Batch] | None = None) -> object:
         mine = replace(settings, **change)  # type: ignore[arg-type]
         network = build_initial_network(mine, examples).train()
         optimizer = build_optimizer(network, mine.optimizer, mine.weight_decay)
@@ -84,21 +84,21 @@ def ways(examples: ExampleSet, settings: TrainConfig) -> dict[str, Callable[[], 
 
         return network, step
 
-    def torchs_own() -> Callable[[], object]:
-        network, step = stepper({})  # type: ignore[misc]
+    def build_torch_step() -> Callable[[], object]:
+        network, step = build_step({})  # type: ignore[misc]
         for layer in network.modules():
             if isinstance(layer, DepthwiseConv):
                 layer.forward = super(DepthwiseConv, layer).forward  # type: ignore[method-assign]
         return step
 
     return {
-        "loading alone": lambda: collate(examples, chosen),
+        "loading only": lambda: collate(examples, chosen),
         "loading and augmentation": lambda: next(fresh),
-        "training, augmentation in turn": stepper({}, fresh)[1],  # type: ignore[index]
-        "training in memory": stepper({})[1],  # type: ignore[index]
-        "the same, torch's backward pass": torchs_own(),
-        "the same, float32": stepper({"precision": "float32"})[1],  # type: ignore[index]
-        "locanet in memory": stepper({"architecture": "locanet"})[1],  # type: ignore[index]
+        "training with augmentation": build_step({}, fresh)[1],  # type: ignore[index]
+        "training in memory": build_step({})[1],  # type: ignore[index]
+        "the same, torch's backward pass": build_torch_step(),
+        "the same, float32": build_step({"precision": "float32"})[1],  # type: ignore[index]
+        "locanet in memory": build_step({"architecture": "locanet"})[1],  # type: ignore[index]
     }
 
 
@@ -110,23 +110,23 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=1)
     args = parser.parse_args()
     torch.set_num_threads(args.threads)
-    keep_freed_memory(2**31 - 1)  # as training does
+    keep_freed_memory(2**31 - 1)  # like `dmrl train`
     settings = replace(recipe.load(args.recipe, "train", TrainConfig), device="cpu")
     spent: dict[str, list[float]] = {}
     with tempfile.TemporaryDirectory() as name:
-        measured = ways(build(Path(name), args.images), settings)
+        measured = build_steps(build(Path(name), args.images), settings)
         for turn in range(TURNS + 1):
             for title in sorted(measured, reverse=bool(turn % 2)):
                 begun = time.process_time()
                 for _ in range(STEPS):
                     measured[title]()
                 seconds = (time.process_time() - begun) / STEPS
-                if turn:  # the first turn warms up
+                if turn:  # the first turn is a warm-up
                     spent.setdefault(title, []).append(seconds)
     rates = {t: settings.batch_size / float(np.median(spent[t])) for t in measured}
     rows = [(title, round(rate)) for title, rate in rates.items()]
     what = f"{args.recipe}, batches of {settings.batch_size}, {args.threads} threads"
-    print_table(what, ("what", "images per cpu-second"), rows)
+    print_table(what, ("work", "images per cpu-second"), rows)
 
 
 if __name__ == "__main__":

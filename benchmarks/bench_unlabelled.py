@@ -1,12 +1,12 @@
-"""What a network learns of rooms from flights there: without labels, and with labels without UWB.
+"""Compare adapting a network to new rooms with unlabelled flights, and with labels without UWB.
 
     python benchmarks/bench_unlabelled.py FOLDER [--places 651 652 653 654] [--seeds 3]
 
-In each place two robots that see each other fly 40 s, with sketched images. All networks learn from
-300 labelled sketches of other places. Some also learn from the flights: by the consistency loss,
-with the robots of a flight apart (images of one camera) or together (of two robots), or from
-``label --detections`` without ranges. All are judged by other flights in the same places. FOLDER
-keeps what is made.
+In each place two robots fly for 40 s in view of each other, with sketched images. All networks
+learn from 300 labelled sketches of other places. Some also learn from the flights. They use the
+consistency loss on images of one camera or on those of both robots, or labels of
+``label --detections`` without ranges. All are evaluated on other flights in the same places. FOLDER
+keeps all files; a later run reuses them.
 """
 
 import argparse
@@ -28,7 +28,7 @@ FIGURES = "ap_16_px", "recall", "depth_mae_m", "median_px"
 
 
 def fly(folder: Path, place: int, seed: int) -> Path:
-    """Fly in a place and predict the images, unless it is done."""
+    """Fly in a place and run dmrl-nano on the images, unless the recording exists."""
     raw, seen = folder / f"flight-{place}-{seed}.mcap", folder / f"seen-{place}-{seed}.mcap"
     if not seen.exists():
         dmrl.fly(
@@ -40,7 +40,7 @@ def fly(folder: Path, place: int, seed: int) -> Path:
 
 
 def keep(seen: Path, robots: Sequence[str]) -> Path:
-    """Keep the topics of some robots, without ranges, unless it is done."""
+    """Copy the topics of some robots without ranges, unless the copy exists."""
     out = seen.with_name(f"{'-'.join(robots)}-of-{seen.name}")
     if not out.exists():
         dmrl.trim(seen, out, topic=[f"/{robot}/{log}" for robot in robots for log in LOGS])
@@ -48,7 +48,7 @@ def keep(seen: Path, robots: Sequence[str]) -> Path:
 
 
 def draw(folder: Path) -> Path:
-    """Draw labelled images of other places, unless it is done."""
+    """Sketch labelled images of other places, unless the recording exists."""
     out = folder / "sketches.mcap"
     if not out.exists():
         pictures = dmrl.sketch(folder / "sketches", images=300, empty_share=0.4, seed=5)
@@ -57,7 +57,7 @@ def draw(folder: Path) -> Path:
 
 
 def label(flights: Sequence[Path]) -> list[Path]:
-    """Label flights by detections and odometry, unless it is done."""
+    """Label flights by detections and odometry, unless the labels exist."""
     outs = [flight.with_name(f"labelled-{flight.name}") for flight in flights]
     for flight, out in zip(flights, outs, strict=True):
         if not out.exists():
@@ -66,14 +66,14 @@ def label(flights: Sequence[Path]) -> list[Path]:
 
 
 def make_dataset(out: Path, recordings: Sequence[Path]) -> Path:
-    """Make a dataset of all images, unless it is done."""
+    """Make a dataset of all images, unless it exists."""
     if not out.exists():
         dmrl.make_dataset(list(recordings), out, split="none")
     return out
 
 
 def train(folder: Path, flights: Sequence[Path], weight: float, seed: int) -> dict[str, Path]:
-    """Train the networks, unless it is done; return their folders by title."""
+    """Train the networks, unless they exist; return their folders by title."""
     apart = [keep(flight, [robot]) for flight in flights for robot in ROBOTS]
     together = [keep(flight, ROBOTS) for flight in flights]
     sketches = draw(folder)
@@ -107,7 +107,7 @@ def train(folder: Path, flights: Sequence[Path], weight: float, seed: int) -> di
 
 
 def judge(model: Path, flights: Sequence[Path]) -> list[float]:
-    """Return the mean figures of a network in some flights."""
+    """Return the mean figures of a network over some flights."""
     rows = []
     for flight in flights:
         seen = model / f"on-{flight.name}"
@@ -139,13 +139,11 @@ def main() -> None:
         for spread in ((np.mean(figures, axis=0), np.std(figures, axis=0)),)
     ]
     headers = ["training", *FIGURES]
-    print_table(
-        f"flights in the same places, mean and spread of {given.seeds} seeds", headers, rows
-    )
+    print_table(f"flights in the same places, mean and std of {given.seeds} seeds", headers, rows)
 
 
 def judge_shipped(folder: Path, flights: Sequence[Path]) -> list[float]:
-    """Return the mean figures of the network that ships; `fly` has run it."""
+    """Return the mean figures of the shipped network, whose detections `fly` has recorded."""
     rows = [dmrl.evaluate(flight, draws=1)["overall"] for flight in flights]
     return [float(np.mean([row[name]["value"] for row in rows])) for name in FIGURES]
 

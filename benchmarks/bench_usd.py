@@ -1,11 +1,10 @@
-"""Micro-SD logs to arrays: dmrl against a plain decoder in Python, one process.
+"""Compare decoding micro-SD logs by dmrl with a plain Python decoder.
 
 Run as ``python benchmarks/bench_usd.py LOG...``. The plain decoder unpacks value by value with
-``struct``, appends each to its list, and makes arrays of the lists in the end, as the script
-that comes with the firmware and its users do. Both check the CRC. They take turns, so that a busy
-machine slows both down, and the process keeps the memory that it frees: pages new from the system
-would cost as much as the decoding. Prints CPU time of both, the best of some rounds each, their
-ratio, and whether every value agrees.
+``struct``, appends each to a list, and converts the lists to arrays, like the script of the
+firmware. Both check the CRC. They take turns, so that other load slows both alike. The process
+keeps freed memory, because new pages from the system would cost as much as the decoding. Prints the
+minimum CPU time of both, their ratio, and whether all values agree.
 """
 
 import struct
@@ -23,25 +22,25 @@ ROUNDS = 40
 KEPT_BYTES = 1 << 24
 
 
-def text(data: bytes, at: int) -> tuple[str, int]:
-    """Return a string that ends in 0, and its end."""
+def read_text(data: bytes, at: int) -> tuple[str, int]:
+    """Return a zero-terminated string and the offset after it."""
     end = data.index(0, at)
     return data[at:end].decode(), end + 1
 
 
-def plain(data: bytes) -> dict[str, dict[str, np.ndarray]]:
-    """Arrays by event and variable, value by value."""
+def decode_plainly(data: bytes) -> dict[str, dict[str, np.ndarray]]:
+    """Decode a log value by value; return arrays by event and variable."""
     assert zlib.crc32(data[:-4]) == struct.unpack("<I", data[-4:])[0]
     version, count = struct.unpack("<HH", data[1:5])
     at, kinds = 5, {}
     found: dict[str, dict[str, list[float]]] = {}
     for _ in range(count):
         (number,) = struct.unpack("<H", data[at : at + 2])
-        name, at = text(data, at + 2)
+        name, at = read_text(data, at + 2)
         (size,) = struct.unpack("<H", data[at : at + 2])
         at, names, codes = at + 2, [], "<"
         for _ in range(size):
-            variable, at = text(data, at)
+            variable, at = read_text(data, at)
             names.append(variable[:-3])
             codes += variable[-2]
         kinds[number] = (name, names, codes, struct.calcsize(codes))
@@ -60,16 +59,16 @@ def plain(data: bytes) -> dict[str, dict[str, np.ndarray]]:
     return {name: {k: np.array(v) for k, v in rows.items()} for name, rows in found.items()}
 
 
-def cpu_ms(run: Callable[[bytes], object], data: bytes) -> float:
-    """CPU milliseconds of one run."""
+def measure_cpu_ms(run: Callable[[bytes], object], data: bytes) -> float:
+    """Return the CPU time of one run, milliseconds."""
     before = time.process_time()
     run(data)
     return 1e3 * (time.process_time() - before)
 
 
 def agree(data: bytes) -> bool:
-    """Whether both find the same values."""
-    wanted = plain(data)
+    """Return whether both decoders give the same values."""
+    wanted = decode_plainly(data)
     return all(
         np.array_equal(column, wanted[block.name][name].astype(column.dtype), equal_nan=True)
         for block in decode_log(data).blocks
@@ -78,15 +77,18 @@ def agree(data: bytes) -> bool:
 
 
 def main(*logs: str) -> None:
-    """One line per log."""
-    # The C library gives nothing back below twice the largest block that it saw freed.
+    """Print a line for each log."""
+    # Freeing a large block raises the threshold above which glibc returns memory to the system.
     np.empty(KEPT_BYTES, np.uint8)
     print("log, records, MB, plain ms, dmrl ms, ratio, equal")
     for name in logs:
         data = Path(name).read_bytes()
         records = sum(len(block.time_ns) for block in decode_log(data).blocks)
         rounds = [
-            (cpu_ms(plain, data), min(cpu_ms(decode_log, data) for _ in range(10)))
+            (
+                measure_cpu_ms(decode_plainly, data),
+                min(measure_cpu_ms(decode_log, data) for _ in range(10)),
+            )
             for _ in range(ROUNDS)
         ]
         slow, fast = np.min(rounds, axis=0)

@@ -1,10 +1,11 @@
-"""A long flight in the viewer: CPU time and memory. How soon it is seen: bench_view_first.py.
+"""Measure CPU time and memory to prepare a long flight for the viewer.
 
-Run as ``python benchmarks/bench_view.py [RECORDING] [--minutes 5]``. Without a recording: a flight
-of two robots with a camera each, 20 images a second, truth and estimates as labels, detections and
-maps; images are drawn once a second and repeated, which costs the viewer the same. Then, each in a
-process of its own: the .rrd by ``dmrl view``, the same recording by rerun's own importer as the
-peer (it shows no label, detection or plot), and a flight of half the length.
+Run as ``python benchmarks/bench_view.py [RECORDING] [--minutes 5]``. By default it makes a flight
+of two robots with a camera each, 20 images per second, labels of truth and estimate, detections and
+maps. Images are drawn once per second and repeated, which costs the viewer the same. Each .rrd file
+is written in its own process: by ``dmrl view`` from the recording and from its first half, and by
+rerun's own importer of MCAP for comparison, which shows no labels, detections or plots.
+bench_view_first.py measures the time to the first image.
 """
 
 import argparse
@@ -30,7 +31,7 @@ ROWS, COLS = 28, 40
 
 
 def write(path: Path, minutes: float) -> int:
-    """Write the flight; return the number of images."""
+    """Simulate and write the flight; return the number of images."""
     flown = path.with_name(f"flown-{path.name}")
     settings = fly.Settings(duration_s=60 * minutes, camera=True, camera_rate_hz=1.0)
     fly.run(flown, settings)
@@ -88,49 +89,49 @@ def _predict(sink: RecordingWriter, time_ns: int, robot: str, rng: np.random.Gen
     sink.write(time_ns, topics.GRID(robot), grid)
 
 
-def with_dmrl(path: Path, out: Path, layout: str) -> dict[str, float]:
-    """CPU seconds and peak memory of ``dmrl view --save``."""
+def measure_dmrl(path: Path, out: Path, layout: str) -> dict[str, float]:
+    """Return CPU seconds, peak memory and file size of ``dmrl view --save``."""
     begun = time.process_time()
     save([path], out, Settings(layout=layout))  # type: ignore[arg-type]
     peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    return {"cpu_s": time.process_time() - begun, "peak_mb": peak_mb, "rrd_mb": size_mb(out)}
+    return {"cpu_s": time.process_time() - begun, "peak_mb": peak_mb, "rrd_mb": read_size_mb(out)}
 
 
-def with_rerun(path: Path, out: Path) -> dict[str, float]:
-    """Measure rerun's own importer of MCAP."""
+def measure_rerun(path: Path, out: Path) -> dict[str, float]:
+    """Return CPU seconds, peak memory and file size of rerun's own importer of MCAP."""
     program = viewer_process.build_command(viewer_process.LOOPBACK)[0]
     subprocess.run([program, "mcap", "convert", str(path), "-o", str(out)], check=True)
     used = resource.getrusage(resource.RUSAGE_CHILDREN)
     return {
         "cpu_s": used.ru_utime + used.ru_stime,
         "peak_mb": used.ru_maxrss / 1024,
-        "rrd_mb": size_mb(out),
+        "rrd_mb": read_size_mb(out),
     }
 
 
-def size_mb(path: Path) -> float:
-    """Size of a file."""
+def read_size_mb(path: Path) -> float:
+    """Return the size of a file, MB."""
     return path.stat().st_size / 1e6
 
 
-def apart(*arguments: object) -> dict[str, float]:
-    """One measurement, in a fresh process."""
+def run_in_process(*arguments: object) -> dict[str, float]:
+    """Run this script with some arguments in a new process; return the figures it prints."""
     command = [sys.executable, __file__, *map(str, arguments)]
     done = subprocess.run(command, check=True, capture_output=True, text=True)
     return dict(json.loads(done.stdout.splitlines()[-1]))
 
 
 def measure(what: str, path: Path, layout: str) -> dict[str, float]:
-    """Run the measurement of this name."""
+    """Measure rerun or dmrl in this process, and remove the file it writes."""
     out = path.with_suffix(f".{what}.rrd")
     try:
-        return with_rerun(path, out) if what == "rerun" else with_dmrl(path, out, layout)
+        return measure_rerun(path, out) if what == "rerun" else measure_dmrl(path, out, layout)
     finally:
         out.unlink(missing_ok=True)
 
 
 def main() -> None:
-    """Measure and print."""
+    """Print the table of each layout."""
     if sys.argv[1:2] == ["measure"]:
         print(json.dumps(measure(sys.argv[2], Path(sys.argv[3]), sys.argv[4])))
         return
@@ -145,17 +146,19 @@ def main() -> None:
         held = read_summary(long)
         middle_ns = (held.start_ns + held.end_ns) // 2
         trim(long, half, end_ns=middle_ns)
-        print(f"{long.name}: {size_mb(long):.0f} MB, {(held.end_ns - held.start_ns) / 1e9:.0f} s")
-        peer = apart("measure", "rerun", long, "-")
+        print(
+            f"{long.name}: {read_size_mb(long):.0f} MB, {(held.end_ns - held.start_ns) / 1e9:.0f} s"
+        )
+        peer = run_in_process("measure", "rerun", long, "-")
         print(f"{'':<26}{'cpu-s':>8}{'peak MB':>10}{'.rrd MB':>10}")
         rows = {"rerun mcap convert": peer}
         for layout in ("image", "flight"):
-            rows[f"dmrl view, {layout}"] = apart("measure", "dmrl", long, layout)
-            rows["  half the length"] = apart("measure", "dmrl", half, layout)
+            rows[f"dmrl view, {layout}"] = run_in_process("measure", "dmrl", long, layout)
+            rows["  half the length"] = run_in_process("measure", "dmrl", half, layout)
             for name, row in rows.items():
                 print(f"{name:<26}{row['cpu_s']:8.1f}{row['peak_mb']:10.0f}{row['rrd_mb']:10.0f}")
             shown = rows[f"dmrl view, {layout}"]
-            print(f"{'  ratio to the peer':<26}{shown['cpu_s'] / peer['cpu_s']:8.2f}")
+            print(f"{'  CPU ratio to rerun':<26}{shown['cpu_s'] / peer['cpu_s']:8.2f}")
             rows = {}
 
 

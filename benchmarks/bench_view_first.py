@@ -1,10 +1,10 @@
-"""How soon `dmrl view` shows the first image of a long recording.
+"""Measure the time until `dmrl view` shows the first image of a long recording.
 
-Run as ``python benchmarks/bench_view_first.py RECORDING [--times 5]``, the recording as
-``bench_view.py`` says. The command itself is run, its viewer without a screen, and asked for a
-picture every 0.1 s; the clock starts with the process, so imports count. Each layout, in turns:
-with the recording in memory, and with it on the disk only (Linux). Do it on an idle computer: CPU
-seconds stand beside the seconds because nothing else is worth comparing on a busy one.
+Run as ``python benchmarks/bench_view_first.py RECORDING [--times 5]``, with a recording as
+described in ``bench_view.py``. The command runs with a viewer without a screen, and a screenshot is
+taken every 0.1 s. The time starts with the process, so it includes imports. Each layout is measured
+with the recording in the page cache, and with it on disk only (Linux), in turns. Use an idle
+computer; on a busy one only the CPU seconds can be compared.
 """
 
 import argparse
@@ -23,10 +23,11 @@ from dmrl.images.codec import Rgb, decode, encode_png
 from dmrl.viewer.window import desktop, viewer_process
 
 SHOWS_COLOURS = 2000
-"""More than panels without an image have."""
+"""Number of colours above which a screenshot shows an image, not only empty panels."""
 LOOK_EVERY_S, PATIENCE_S = 0.1, 120.0
 
-# `dmrl view`, its viewer without a screen and at a known port; says when everything is sent.
+
+# Runs `dmrl view` with a viewer without a screen at a known port; prints "sent" when all is sent.
 COMMAND = """
 import sys
 from dmrl.cli import main
@@ -43,24 +44,24 @@ main()
 """
 
 
-def first_picture(path: Path, layout: str, *, kept: Path | None) -> dict[str, float]:
-    """Seconds until the first image is seen and until all is sent, and CPU seconds until then.
+def measure_first_image(path: Path, layout: str, *, kept: Path | None) -> dict[str, float]:
+    """Return the seconds until the first image and until all is sent, and CPU seconds.
 
     Parameters
     ----------
     path
         Recording.
     layout
-        Layout.
+        Layout of the viewer.
     kept
-        Where to write the first picture.
+        Path to write the first screenshot with an image; None: it is not written.
     """
     port = viewer_process.find_free_port(viewer_process.LOOPBACK)
     words = [sys.executable, "-c", COMMAND, str(port), "view", str(path), "--layout", layout]
     begun = time.monotonic()
     with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as running:
         try:
-            picture = _until_seen(running, port)
+            picture = _wait_for_image(running, port)
             found = {"first_s": time.monotonic() - begun}
             found |= {f"{name}_cpu_s": s for name, s in _cpu_s(running.pid).items()}
             assert running.stdout is not None
@@ -73,7 +74,7 @@ def first_picture(path: Path, layout: str, *, kept: Path | None) -> dict[str, fl
     return found
 
 
-def _until_seen(running: subprocess.Popen[str], port: int) -> Rgb:
+def _wait_for_image(running: subprocess.Popen[str], port: int) -> Rgb:
     deadline = time.monotonic() + PATIENCE_S
     while time.monotonic() < deadline and running.poll() is None:
         try:
@@ -84,7 +85,7 @@ def _until_seen(running: subprocess.Popen[str], port: int) -> Rgb:
         if len(np.unique(rgb[::4, ::4].reshape(-1, 3), axis=0)) > SHOWS_COLOURS:
             return rgb
         time.sleep(LOOK_EVERY_S)
-    raise SystemExit("no picture")
+    raise SystemExit(f"the viewer showed no image within {PATIENCE_S:g} s")
 
 
 def _cpu_s(pid: int) -> dict[str, float]:
@@ -93,30 +94,30 @@ def _cpu_s(pid: int) -> dict[str, float]:
     return {name: times.user + times.system for name, times in used.items()}
 
 
-def in_memory(path: Path) -> None:
-    """Have the file in the page cache."""
+def load_to_cache(path: Path) -> None:
+    """Read the file, so that it is in the page cache."""
     with path.open("rb") as stream:
         while stream.read(1 << 24):
             pass
 
 
-def on_disk(path: Path) -> None:
-    """Have the file out of the page cache."""
+def drop_from_cache(path: Path) -> None:
+    """Drop the file from the page cache."""
     with path.open("rb") as stream:
         os.fsync(stream.fileno())
         os.posix_fadvise(stream.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
 
 
-PLACES: dict[str, Callable[[Path], None]] = {"memory": in_memory, "disk": on_disk}
+PLACES: dict[str, Callable[[Path], None]] = {"memory": load_to_cache, "disk": drop_from_cache}
 
 
 def main() -> None:
-    """Measure and print."""
+    """Print a line for each layout and place of the recording."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("recording", type=Path)
     parser.add_argument("--times", type=int, default=5)
     parser.add_argument("--layouts", nargs="+", default=["image", "flight"])
-    parser.add_argument("--keep", type=Path, help="folder for the first pictures")
+    parser.add_argument("--keep", type=Path, help="folder for the first screenshots")
     given = parser.parse_args()
     rows: dict[tuple[str, str], list[dict[str, float]]] = {}
     for number in range(given.times):
@@ -125,10 +126,11 @@ def main() -> None:
                 prepare(given.recording)
                 name = f"{layout}-{place}-{number}.png"
                 kept = None if given.keep is None else given.keep / name
-                found = first_picture(given.recording, layout, kept=kept)
+                found = measure_first_image(given.recording, layout, kept=kept)
                 rows.setdefault((layout, place), []).append(found)
-    print(f"{given.times} times each; first picture, s; CPU until then, s; all sent, s")
-    print(f"{'layout':<8}{'in':<8}{'median':>8}{'worst':>8}{'dmrl':>8}{'viewer':>8}{'sent':>8}")
+    print(f"{given.times} runs each; all in seconds")
+    print("first image: median and worst; CPU time until then: dmrl and viewer; all data sent")
+    print(f"{'layout':<8}{'from':<8}{'median':>8}{'worst':>8}{'dmrl':>8}{'viewer':>8}{'sent':>8}")
     for (layout, place), runs in rows.items():
         keys = ("first_s", "dmrl_cpu_s", "viewer_cpu_s", "sent_s")
         first, dmrl, viewer, sent = (median(run[key] for run in runs) for key in keys)

@@ -1,4 +1,4 @@
-"""Many images of a recording on one sheet, with real ones beside them.
+"""Draw images of a recording on one sheet, with real images below them.
 
 python benchmarks/contact_sheet.py REC.mcap SHEET.png [REAL_IMAGE ...]
 """
@@ -19,7 +19,7 @@ TILE_PX = (160, 112)
 
 
 def tile(data: bytes, name: object) -> np.ndarray:
-    """Return an image at the size of a tile, (112, 160, 3)."""
+    """Decode an image and scale it to the size of a tile, (112, 160, 3)."""
     rgb = decode(data, name)
     return crop_and_scale(rgb, (0, 0, rgb.shape[1], rgb.shape[0]), *TILE_PX)
 
@@ -31,7 +31,7 @@ def main(recording: str, sheet: str, *real: str) -> None:
     tiles += [tile(Path(name).read_bytes(), name) for name in real]
     tiles += [np.full_like(tiles[0], 255)] * (-len(tiles) % COLUMNS)
     rows = [np.hstack(tiles[k : k + COLUMNS]) for k in range(0, len(tiles), COLUMNS)]
-    # 255 colours: a third of the size, and nobody sees it on a sheet.
+    # With 255 colours the file has a third of the size, without a visible difference.
     Image.fromarray(np.vstack(rows)).quantize(255).save(sheet, optimize=True)
 
 

@@ -1,4 +1,4 @@
-"""Twenty kinds of fault that a flight may have, and how bad labels may get with each."""
+"""Twenty faults of a flight, and limits on the errors of labels with each."""
 
 from dataclasses import dataclass
 
@@ -9,16 +9,16 @@ from dmrl.flight import Fault
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """What goes wrong, and what the batch solve is held to besides the general ceilings.
+    """Faults of a flight, and limits of the batch solve in addition to the general ones.
 
     Parameters
     ----------
     faults
-        Of a flight of 100 s.
+        Faults of a flight of 100 s.
     outside_m
-        Ceiling on the median RMSE outside the windows of the faults, calibrated noise.
+        Largest median RMSE outside the windows of the faults, with calibrated noise.
     kept
-        Floor under the share that is kept, calibrated noise.
+        Smallest share of kept positions, with calibrated noise.
     """
 
     faults: tuple[Fault, ...] = ()
@@ -26,17 +26,17 @@ class Case:
     kept: float = 0.0
 
 
-def bursts(number: int, lasts_s: float) -> tuple[Fault, ...]:
-    """So many bursts of ranges that are 1 m too long."""
+def build_bursts(number: int, lasts_s: float) -> tuple[Fault, ...]:
+    """Return a fault with some bursts of ranges that are 1 m too long."""
     return (Fault("nlos", "cf1", "cf2", size=1.0, duration_s=lasts_s, number=number),)
 
 
 CASES = {
     "none": Case((), 0.12, 0.9),
-    "1 burst of 3 s": Case(bursts(1, 3.0), 0.12, 0.8),
-    "2 bursts of 3 s": Case(bursts(2, 3.0), 0.15),
-    "8 bursts of 3 s": Case(bursts(8, 3.0), 0.20),
-    "8 bursts of 1 s": Case(bursts(8, 1.0), 0.20),
+    "1 burst of 3 s": Case(build_bursts(1, 3.0), 0.12, 0.8),
+    "2 bursts of 3 s": Case(build_bursts(2, 3.0), 0.15),
+    "8 bursts of 3 s": Case(build_bursts(8, 3.0), 0.20),
+    "8 bursts of 1 s": Case(build_bursts(8, 1.0), 0.20),
     "no ranges for 30 s": Case((Fault("range_gap", "cf1", "cf2"),), 0.16),
     "yaw rate bias, peer": Case((Fault("yaw_rate_bias", "cf2"),)),
     "yaw rate bias, own": Case((Fault("yaw_rate_bias", "cf1"),)),
@@ -58,11 +58,11 @@ CASES = {
     "crash": Case((Fault("crash", "cf2"),)),
     "burst, stuck, crash": Case(
         (
-            *bursts(2, 3.0),
+            *build_bursts(2, 3.0),
             Fault("velocity_stuck", "cf1", start_s=40.0, duration_s=5.0),
             Fault("crash", "cf2"),
         )
     ),
 }
 BAD = {"calibrated": (0.02, 0.10), "realistic": (0.04, 0.20), "harsh": (0.10, 0.50)}
-"""Ceilings on the share of kept positions that are bad: over all flights, and in the worst."""
+"""Largest share of kept positions that may be bad: over all flights, and in the worst flight."""

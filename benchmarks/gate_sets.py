@@ -1,4 +1,4 @@
-"""The sets of images that the release gate judges a network on; see `release_gate`."""
+"""Sets of images on which the release gate evaluates a network; see `release_gate`."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -27,14 +27,14 @@ FRAMES_PX = {
     "img00375": (298, 138),
     "img00495": (98, 130),
 }
-"""Centres of the drones in the real frames, read by eye."""
+"""Centres of the drones in the real images, read by eye."""
 NO_LIGHT = Light("", (0.0, 0.0, 0.0), 0.0, np.array([-1.0, 0, 0]), 0.0, (1.0, 1.0, 1.0), 0.1)
 Set = tuple[list[Rgb], list[NDArray[np.float64]]]
-"""Images, and (K, 3) labels of each: u, v, depth."""
+"""Images, and (K, 3) labels of each: u, v (pixels) and depth (metres)."""
 
 
-def fitted(path: Path) -> Rgb:
-    """Read an image, crop its middle and scale it to the size that the networks take."""
+def read_fitted(path: Path) -> Rgb:
+    """Read an image, crop its middle and scale it to the input size of the networks."""
     rgb = decode(path.read_bytes(), path)
     height, width, _ = rgb.shape
     scale = min(width / SIZE_PX[0], height / SIZE_PX[1])
@@ -43,8 +43,8 @@ def fitted(path: Path) -> Rgb:
     return crop_and_scale(rgb, box, *SIZE_PX)
 
 
-def published(folder: Path, *, split: str | None) -> Set:
-    """Load the published renders of a split, with their true projection."""
+def load_published(folder: Path, *, split: str | None) -> Set:
+    """Load the published renders of a split, with labels projected from the true positions."""
     found = [item for item in load_images(folder) if split is None or item.split == split]
     labels = []
     for item in found:
@@ -53,22 +53,22 @@ def published(folder: Path, *, split: str | None) -> Set:
     return [decode(item.path.read_bytes(), item.path) for item in found], labels
 
 
-def frames(folder: Path) -> Set:
-    """Load the real frames with a drone; depths are unknown."""
+def load_frames(folder: Path) -> Set:
+    """Load the real images with a drone; their depths are unknown."""
     paths = sorted(path for path in folder.glob("img*.ppm") if path.stem in FRAMES_PX)
     labels = [np.array([[*FRAMES_PX[path.stem], np.nan]]) for path in paths]
     return [decode(path.read_bytes(), path) for path in paths], labels
 
 
-def empty(folder: Path, part: str) -> Set:
-    """Every second real frame without a drone."""
+def load_empty(folder: Path, part: str) -> Set:
+    """Load the half of the real images without a drone that belongs to a part."""
     paths = sorted(path for path in folder.rglob("*") if path.suffix in (".pgm", ".png"))
     mine = paths[0 if part == "choose" else 1 :: 2]
-    return [fitted(path) for path in mine], [np.zeros((0, 3))] * len(mine)
+    return [read_fitted(path) for path in mine], [np.zeros((0, 3))] * len(mine)
 
 
-def composites(cutouts: Path, behind: Sequence[Rgb], seed: int) -> Set:
-    """Two composites on every frame, with exact labels."""
+def make_composites(cutouts: Path, behind: Sequence[Rgb], seed: int) -> Set:
+    """Paste a cut-out on every background, twice, with exact labels."""
     camera = replace(find_camera(Path("aideck")), mount_rad=(0.0, 0.0, 0.0), delay_s=0.0)
     renderer = CutoutRenderer(open_cutouts(cutouts), CUTOUT_WIDTH_M, 15.0, matched=True)
     rng = np.random.default_rng(seed)
@@ -88,7 +88,7 @@ def composites(cutouts: Path, behind: Sequence[Rgb], seed: int) -> Set:
     return [np.asarray(shot.rgb) for shot in shots], labels
 
 
-def renders(recording: Path) -> Set:
+def load_renders(recording: Path) -> Set:
     """Load the images of a rendered recording, and their labels."""
     images = [decode(one.message.data, recording) for one in read(recording, "/cf1/camera/image")]
     peers = [
@@ -101,5 +101,5 @@ def renders(recording: Path) -> Set:
 
 
 def join(sets: Sequence[Set]) -> Set:
-    """All images and labels of some sets."""
+    """Concatenate some sets."""
     return [one for images, _ in sets for one in images], [row for _, rows in sets for row in rows]

@@ -1,7 +1,7 @@
-"""A plain factor graph over a pair, by gtsam: what someone would write in an afternoon.
+"""A plain factor graph of a pair in gtsam, without sensor error models, as a baseline.
 
-Poses of both robots ten times a second, odometry between them, ranges between the two with
-Cauchy's loss. Starts are tried all around the first range. No constants are solved for.
+It has poses of both robots ten times per second, odometry factors between successive poses, and
+range factors with a Cauchy loss. Several initial bearings and headings of the peer are tried.
 """
 
 from itertools import pairwise, product
@@ -17,10 +17,10 @@ from dmrl.geometry.frames import Array
 KEY_HZ = 10.0
 FIRST_S = 20.0
 DIRECTIONS = 5
-"""Bearings, and headings, that are tried."""
+"""Number of initial bearings, and of initial headings."""
 KEPT = 3
 RANGE_STD_M, STEP_STD_M, TURN_STD_RAD = 0.10, 0.02, 0.002
-"""Of a range; of a tenth of a second of odometry: the noise of bench_label_faults' sensors."""
+"""Noise of a range and of 0.1 s of odometry, as simulated in bench_label_faults."""
 MARGINAL_EVERY = 5
 ANCHOR = noiseModel.Isotropic.Sigma(3, 1e-6)
 ODOMETRY = noiseModel.Diagonal.Sigmas(np.array([STEP_STD_M, STEP_STD_M, TURN_STD_RAD]))
@@ -30,33 +30,33 @@ RANGE = noiseModel.Robust.Create(
 
 
 Solved = tuple[Array, Array, Array]
-"""Times (K,), states (K, 3) and covariances (K, 3, 3) of a peer seen by its observer."""
+"""Times (K,), relative poses (K, 3: x, y, yaw) and covariances (K, 3, 3) of a peer."""
 
 
 def solve(pair: Pair) -> tuple[Solved, Solved]:
-    """Solve a pair: the peer seen by the observer, and the observer seen by the peer."""
+    """Solve a pair; return the peer relative to the observer, and the observer to the peer."""
     key_s = np.arange(pair.time_s[0], pair.time_s[-1], 1 / KEY_HZ)
     moves = [
         preintegrate(track, pair.time_s).relative_motion(key_s[:-1], key_s[1:])
         for track in (pair.own, pair.peer)
     ]
-    level_m = _level(pair, key_s)
+    level_m = _average_ranges(pair, key_s)
     few = min(len(key_s), int(FIRST_S * KEY_HZ))
-    short, whole = _graph(moves, level_m, few), _graph(moves, level_m, len(key_s))
+    short, whole = _build_graph(moves, level_m, few), _build_graph(moves, level_m, len(key_s))
     first = float(level_m[np.isfinite(level_m)][0])
     angles = np.arange(DIRECTIONS) * 2 * np.pi / DIRECTIONS
     tried = [
-        _optimised(short, moves, few, gtsam.Pose2(first * np.cos(a), first * np.sin(a), heading))
+        _optimise(short, moves, few, gtsam.Pose2(first * np.cos(a), first * np.sin(a), heading))
         for a, heading in product(angles, angles)
     ]
     likely = sorted(tried, key=short.error)[:KEPT]
-    ends = [_optimised(whole, moves, len(key_s), v.atPose2(_peer(0))) for v in likely]
+    ends = [_optimise(whole, moves, len(key_s), v.atPose2(_peer(0))) for v in likely]
     values = min(ends, key=whole.error)
     at = np.arange(0, len(key_s), MARGINAL_EVERY)
     marginals = gtsam.Marginals(whole, values)
     out = []
     for here, there in ((_own, _peer), (_peer, _own)):
-        found = [_relative(values, marginals, here(k), there(k)) for k in at.tolist()]
+        found = [_compute_relative(values, marginals, here(k), there(k)) for k in at.tolist()]
         states, covariances = zip(*found, strict=True)
         out.append((key_s[at], np.array(states), np.array(covariances)))
     return out[0], out[1]
@@ -70,8 +70,8 @@ def _peer(k: int) -> int:
     return 2 * k + 1
 
 
-def _level(pair: Pair, key_s: Array) -> Array:
-    """(K,) horizontal ranges at the keyframes, medians of those around, or NaN."""
+def _average_ranges(pair: Pair, key_s: Array) -> Array:
+    """Return (K,) horizontal distances at the keyframes, from the median range of each, or NaN."""
     edges = np.searchsorted(
         pair.range_time_s, np.append(key_s, key_s[-1] + 1 / KEY_HZ) - 0.5 / KEY_HZ
     )
@@ -80,8 +80,10 @@ def _level(pair: Pair, key_s: Array) -> Array:
     return np.sqrt(np.maximum(np.array(found) ** 2 - high**2, 0.05**2))
 
 
-def _graph(moves: list[RelativeMotion], level_m: Array, count: int) -> gtsam.NonlinearFactorGraph:
-    """Odometry and ranges of the first keyframes."""
+def _build_graph(
+    moves: list[RelativeMotion], level_m: Array, count: int
+) -> gtsam.NonlinearFactorGraph:
+    """Return a graph of the odometry and ranges of the first keyframes."""
     graph = gtsam.NonlinearFactorGraph()
     graph.add(gtsam.PriorFactorPose2(_own(0), gtsam.Pose2(), ANCHOR))
     for key, way in zip((_own, _peer), moves, strict=True):
@@ -93,10 +95,10 @@ def _graph(moves: list[RelativeMotion], level_m: Array, count: int) -> gtsam.Non
     return graph
 
 
-def _optimised(
+def _optimise(
     graph: gtsam.NonlinearFactorGraph, moves: list[RelativeMotion], count: int, start: gtsam.Pose2
 ) -> gtsam.Values:
-    """Poses of the first keyframes, from dead reckoning with the peer at a start."""
+    """Solve the first keyframes; dead reckoning from the peer's start gives the initial poses."""
     values = gtsam.Values()
     for key, way, pose in ((_own, moves[0], gtsam.Pose2()), (_peer, moves[1], start)):
         for k in range(count):
@@ -106,10 +108,10 @@ def _optimised(
     return gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
 
 
-def _relative(
+def _compute_relative(
     values: gtsam.Values, marginals: gtsam.Marginals, here: int, there: int
 ) -> tuple[Array, Array]:
-    """State (3,) and covariance (3, 3) of one pose in the frame of another."""
+    """Return pose (3,) and covariance (3, 3) of one pose in the frame of another."""
     joint = marginals.jointMarginalCovariance(gtsam.KeyVector([here, there]))
     apart = values.atPose2(here).between(values.atPose2(there))
     by_here, by_there = np.zeros((3, 3)), np.zeros((3, 3))

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The published way of rendering, as a baseline: run in Blender's Python.
+"""The published method of rendering as a baseline, run in Blender's Python.
 
-One full-frame render with the background in the compositor, one more full-frame render per
-robot for its box, pictures through files, nothing kept between images; Cycles, because
-there is no screen. Reads a JSON job: model, samples, lean, folder, and of every image the
-background and each robot's matrix in camera coordinates. As published, light goes on for 12
-bounces and a pixel's filter is wider than the pixel; lean: 2 bounces and a box, as dmrl has them.
+It renders the full image with the background in the compositor, and once more per robot for its
+box. Images pass through files, and nothing is kept between images. It uses Cycles, which needs no
+screen. It reads a JSON job: model, samples, lean, folder, and for every image the background and
+the matrix of each robot in camera coordinates. The published settings have 12 bounces of light and
+a pixel filter wider than a pixel. The lean ones are dmrl's: 2 bounces and a box filter.
 """
 
 import json
@@ -16,7 +16,7 @@ import bpy
 import numpy as np
 from mathutils import Matrix
 
-UNITS_PER_M = 500.0  # the published model is in these, which makes it twice life size
+UNITS_PER_M = 500.0  # of the published model, which is then twice life size
 WORLD_FROM_CAMERA = Matrix(((0, 0, -1, 0), (-1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 0, 1)))
 Z_FROM_Y_UP = Matrix(((1, 0, 0, 0), (0, 0, -1, 0), (0, 1, 0, 0), (0, 0, 0, 1)))
 
@@ -29,7 +29,7 @@ def prepare(job):
     scene.cycles.samples = job["samples"]
     scene.cycles.use_denoising = scene.cycles.use_adaptive_sampling = False
     if job["lean"]:
-        as_dmrl_renders(scene.cycles)
+        apply_lean_settings(scene.cycles)
     scene.render.threads_mode, scene.render.threads = "FIXED", 1
     scene.render.use_persistent_data = False
     scene.render.film_transparent = True
@@ -40,11 +40,11 @@ def prepare(job):
     camera.matrix_world = WORLD_FROM_CAMERA
     camera.data.lens = 120.0 * camera.data.sensor_width / 320
     scene.use_nodes = True
-    scene.node_tree.nodes["Scale"].frame_method = "CROP"  # the file has one that 4.5 lacks
+    scene.node_tree.nodes["Scale"].frame_method = "CROP"  # Blender 4.5 lacks the method in the file
     return scene
 
 
-def as_dmrl_renders(cycles):
+def apply_lean_settings(cycles):
     cycles.pixel_filter_type = "BOX"
     cycles.max_bounces = cycles.diffuse_bounces = cycles.glossy_bounces = 2
     cycles.transparent_max_bounces = 8
@@ -53,7 +53,7 @@ def as_dmrl_renders(cycles):
     cycles.use_light_tree = False
 
 
-def robots_of(scene, matrices):
+def place_robots(scene, matrices):
     first = bpy.data.objects["crazyflie"]
     robots = [first]
     for _ in matrices[1:]:
@@ -66,8 +66,8 @@ def robots_of(scene, matrices):
     return robots
 
 
-def box(path):
-    """First and last column and row of a picture's pixels that are not clear."""
+def read_box(path):
+    """Return first column and row, and last column and row, of the pixels with alpha."""
     image = bpy.data.images.load(str(path))
     width, height = image.size
     alpha = np.array(image.pixels[:]).reshape(height, width, 4)[::-1, :, 3]
@@ -81,7 +81,7 @@ def main(job):
     nodes = scene.node_tree.nodes
     out = Path(job["folder"])
     for k, image in enumerate(job["images"]):
-        robots = robots_of(scene, image["robots"])
+        robots = place_robots(scene, image["robots"])
         background = bpy.data.images.load(image["background"])
         nodes["Image"].image = background
         scene.render.use_compositing = True
@@ -93,7 +93,7 @@ def main(job):
                 other.hide_render = other is not robot
             scene.render.filepath = str(out / "mask.png")
             bpy.ops.render.render(write_still=True)
-            box(out / "mask.png")
+            read_box(out / "mask.png")
         for robot in robots:
             robot.hide_render = False
         for robot in robots[1:]:

@@ -1,22 +1,26 @@
-"""The release gate of a shipped network: every figure, with a floor that it must not fall below.
+"""The release gate of a shipped network: figures, and limits that they must keep.
 
     python benchmarks/release_gate.py MODEL DATA [--part choose|judge] [--held HELD.mcap ...]
         [--flights N] [--floors NAME] [--json] [--curve OUT.png]
         [--calibrate OUT [--threshold-anew] [--renders-only]]
 
-DATA is a folder with the published renders, real frames and cut-outs (`locanet-synthetic`,
-`locanet-multi`, `aideck-frames`, `aideck-empty`, `himax-frames`, `cutouts`); what is missing is
-left out. `--part choose` reads what settings may be chosen on: the published training images,
-which no shipped network learned from, and every second empty frame. `--part judge` reads the
-published test images and the other frames, for a release. `--held` adds renders, several times if
-need be, with recall by distance. `--flights N` flies `fly_follow` N times with the network, seeds
-500 and on, or 600 and on for the part `judge`. `--calibrate OUT` writes the network with confidence
-calibrated on the part `choose` and these renders; `--renders-only` leaves real frames out of that.
+DATA is a folder with the published renders, real images and cut-outs (`locanet-synthetic`,
+`locanet-multi`, `aideck-frames`, `aideck-empty`, `himax-frames`, `cutouts`); missing ones are
+skipped.
 
-A composite is a cut-out of a Crazyflie, 18 to 110 px wide, on an empty frame; two of them on
-every frame. Right: the most confident detection is within 16 px. Believed: it is above the
-threshold, too. Limits are in release_gate.toml beside this file; the exit status is 1 if a figure
-is beyond its own.
+* `--part choose` uses the data on which settings may be tuned: the published training images, on
+  which no shipped network was trained, and every second image without a drone.
+* `--part judge` uses the published test images and the remaining images, for a release.
+* `--held` adds renders, with recall by distance. It may be repeated.
+* `--flights N` flies `fly_follow` N times with the network. Seeds start at 500, or at 600 for the
+  part `judge`.
+* `--calibrate OUT` writes the network with its confidence calibrated on the part `choose` and the
+  renders; `--renders-only` leaves real images out of the calibration.
+
+A composite is a cut-out of a Crazyflie, 18 to 110 px wide, on an image without a drone; each image
+is used twice. "Right" means that the most confident detection is within 16 px, and "believed" that
+it is also above the threshold. The limits are in release_gate.toml beside this file. The exit
+status is 1 if a figure is outside its limits.
 """
 
 import argparse
@@ -29,7 +33,16 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from gate_sets import SIZE_PX, Set, composites, empty, frames, join, published, renders
+from gate_sets import (
+    SIZE_PX,
+    Set,
+    join,
+    load_empty,
+    load_frames,
+    load_published,
+    load_renders,
+    make_composites,
+)
 
 from dmrl import recipe as recipes
 from dmrl.estimation.tracking.flight_metrics import compute_flight_figures
@@ -55,11 +68,12 @@ FLIGHT_SEEDS = {"choose": 500, "judge": 600}
 
 
 def calibrate(model: Model, scored: dict[str, ScoredDetections], out: Path, *, anew: bool) -> None:
-    """Write the network with confidence calibrated, and the threshold chosen anew.
+    """Write the network with calibrated confidence.
 
-    Renders, and composites with empty real frames, count the same. Threshold and rates are those of
-    before, of the same detections under their new confidence. With ``anew`` the threshold is the
-    lowest at which empty renders have at most 0.02 detections an image.
+    The renders, and the composites together with empty real images, have equal weight. Threshold
+    and detector rates are converted to the new confidence, so that the same detections pass. With
+    ``anew`` the threshold becomes the lowest at which empty renders have at most 0.02 detections
+    per image.
     """
     groups = [scored[name] for name in ("held", "composites_and_empty") if name in scored]
     images = np.cumsum([0, *(one.images for one in groups)])[:-1]
@@ -79,7 +93,9 @@ def calibrate(model: Model, scored: dict[str, ScoredDetections], out: Path, *, a
         rates["offset"] -= rates["slope"] * scaling.offset / scaling.slope
         rates["slope"] /= scaling.slope
         rates = {k: np.round(v, 4).tolist() for k, v in rates.items()}
-    before = by_distance("", scored["held"])[".threshold_at_0.02"] if anew else model.threshold
+    before = model.threshold
+    if anew:
+        before = compute_recall_by_distance("", scored["held"])[".threshold_at_0.02"]
     logit = scaling.slope * np.log(before / (1 - before)) + scaling.offset
     known = {**model.training, "calibrated_again": scaling._asdict()}
     threshold = round(float(1 / (1 + np.exp(-logit))), 4)
@@ -89,7 +105,7 @@ def calibrate(model: Model, scored: dict[str, ScoredDetections], out: Path, *, a
 
 
 def score(model: Model, data: Set) -> ScoredDetections:
-    """Detect, and match with the labels."""
+    """Run a network on a set and match its detections with the labels."""
     images, labels = data
     parts = []
     for start in range(0, len(images), 16):
@@ -109,16 +125,16 @@ def score(model: Model, data: Set) -> ScoredDetections:
     return score_detections(len(images), points, Points.concatenate(parts, first))
 
 
-def located(name: str, scored: ScoredDetections, threshold: float) -> dict[str, float]:
-    """Errors, average precision and explained variance of a set with labels."""
+def compute_errors(name: str, scored: ScoredDetections, threshold: float) -> dict[str, float]:
+    """Return errors, average precision and explained variance of a set with labels."""
     one = np.ones((1, scored.images))
     got = {k: float(v[0]) for k, v in compute_metrics(scored, (0, np.inf), threshold, one).items()}
     kept = ("within_20_px", "median_px", "ap_16_px", "depth_mae_m", "r2_u", "r2_v", "r2_depth")
     return {f"{name}.{key}": got[key] for key in kept}
 
 
-def first_detections(name: str, scored: ScoredDetections, threshold: float) -> dict[str, float]:
-    """Shares of images with one label whose best detection is right, and believed, too."""
+def score_best(name: str, scored: ScoredDetections, threshold: float) -> dict[str, float]:
+    """Return the shares of images with one label whose best detection is right, and believed."""
     best = scored.detections.ranks_in_image() == 0
     right = scored.right_16_px[best] >= 0
     believed = right & (scored.detections.confidence[best] >= threshold)
@@ -131,15 +147,15 @@ def first_detections(name: str, scored: ScoredDetections, threshold: float) -> d
     }
 
 
-def alarms(name: str, scored: ScoredDetections, threshold: float) -> dict[str, float]:
-    """Shares of empty images with a detection at the threshold, and detections at 0.9."""
+def count_alarms(name: str, scored: ScoredDetections, threshold: float) -> dict[str, float]:
+    """Return the share of empty images with a detection, and the number of detections from 0.9."""
     image, confidence = scored.detections.image, scored.detections.confidence
     share = len(np.unique(image[confidence >= threshold])) / scored.images
     return {f"{name}.alarms": share, f"{name}.at_0.9": float((confidence >= 0.9).sum())}
 
 
-def by_distance(name: str, scored: ScoredDetections) -> dict[str, float]:
-    """Recall by distance at 0.02 false detections in an image without a drone."""
+def compute_recall_by_distance(name: str, scored: ScoredDetections) -> dict[str, float]:
+    """Return recall by distance at the threshold with 0.02 false detections per empty image."""
     image, confidence = scored.detections.image, scored.detections.confidence
     bare = find_unlabelled_images(scored)
     ghosts = np.sort(confidence[bare[image]])[::-1]
@@ -157,8 +173,8 @@ def by_distance(name: str, scored: ScoredDetections) -> dict[str, float]:
     return out
 
 
-def reliability(name: str, scored: ScoredDetections) -> dict[str, float]:
-    """Share right of the detections of 0.8 and more, and the mean gap to their confidence."""
+def measure_reliability(name: str, scored: ScoredDetections) -> dict[str, float]:
+    """Return confidence and share right of detections from 0.8, and the mean calibration error."""
     sure = scored.detections.confidence >= 0.8
     right = (scored.right_16_px >= 0)[sure]
     said = scored.detections.confidence[sure]
@@ -166,7 +182,8 @@ def reliability(name: str, scored: ScoredDetections) -> dict[str, float]:
         return {}
     curves = compute_curves(scored)
     gap = np.abs(curves.bin_confidence - curves.bin_right)
-    weight = np.where(np.arange(10) >= 1, curves.bin_count, 0)  # what nobody believes is no matter
+    # The lowest bin, confidence below 0.1, is left out: such detections are never used.
+    weight = np.where(np.arange(10) >= 1, curves.bin_count, 0)
     return {
         f"{name}.said_at_0.8": float(said.mean()),
         f"{name}.right_at_0.8": float(right.mean()),
@@ -174,8 +191,8 @@ def reliability(name: str, scored: ScoredDetections) -> dict[str, float]:
     }
 
 
-def far(name: str, scored: ScoredDetections) -> dict[str, float]:
-    """Share within 20 px of the labels from 1.8 m on."""
+def score_far(name: str, scored: ScoredDetections) -> dict[str, float]:
+    """Return the share of labels beyond 1.8 m found within 20 px, and the number of such labels."""
     mine = scored.labels.depth_m >= 1.8
     error = scored.label_error.norm_px[mine]
     return {
@@ -185,7 +202,7 @@ def far(name: str, scored: ScoredDetections) -> dict[str, float]:
 
 
 def fly(eye: Path, part: str, count: int) -> dict[str, float]:
-    """Seconds that a follower holds its leader in view, mean and least of some flights."""
+    """Fly some flights; return mean and minimum of the seconds that the leader is held in view."""
     recipe = recipes.load("fly_follow", "fly", FlySettings)
     held_s, false = [], []
     with tempfile.TemporaryDirectory() as folder:
@@ -202,46 +219,49 @@ def fly(eye: Path, part: str, count: int) -> dict[str, float]:
     }
 
 
-def gate(
+def compute_figures(
     model: Model, data: Path, part: str, held: Sequence[Path]
 ) -> tuple[dict[str, float], dict[str, ScoredDetections]]:
-    """Every figure of a network, and what it is made from."""
+    """Return all figures of a network, and the scored detections by set."""
     split = "train" if part == "choose" else "test"
     threshold, figures = model.threshold, {"threshold": model.threshold}
     scored: dict[str, ScoredDetections] = {}
     bare: list[Rgb] = []
     if (folder := data / "locanet-synthetic").is_dir():
-        scored["single"] = score(model, published(folder, split=split))
-        figures |= located("single", scored["single"], threshold) | far("single", scored["single"])
+        scored["single"] = score(model, load_published(folder, split=split))
+        figures |= compute_errors("single", scored["single"], threshold)
+        figures |= score_far("single", scored["single"])
     if part == "judge" and (folder := data / "locanet-multi").is_dir():
-        scored["multi"] = score(model, published(folder, split=None))
-        figures |= located("multi", scored["multi"], threshold)
+        scored["multi"] = score(model, load_published(folder, split=None))
+        figures |= compute_errors("multi", scored["multi"], threshold)
     if (folder := data / "aideck-frames").is_dir():
-        figures |= first_detections("frames", score(model, frames(folder)), threshold)
+        figures |= score_best("frames", score(model, load_frames(folder)), threshold)
     for name in ("himax-frames", "aideck-empty"):
         if (folder := data / name).is_dir():
-            images = empty(folder, part)
+            images = load_empty(folder, part)
             bare += images[0]
             scored[name] = score(model, images)
-            figures |= alarms(name, scored[name], threshold)
+            figures |= count_alarms(name, scored[name], threshold)
     if bare and (folder := data / "cutouts").is_dir():
-        drawn = composites(folder, bare, 0 if part == "choose" else 1)
+        drawn = make_composites(folder, bare, 0 if part == "choose" else 1)
         scored["composites"] = score(model, drawn)
-        figures |= first_detections("composites", scored["composites"], threshold)
+        figures |= score_best("composites", scored["composites"], threshold)
         both = (drawn[0] + bare, drawn[1] + [np.zeros((0, 3))] * len(bare))
         scored["composites_and_empty"] = score(model, both)
-        figures |= reliability("composites_and_empty", scored["composites_and_empty"])
+        both_scored = scored["composites_and_empty"]
+        figures |= measure_reliability("composites_and_empty", both_scored)
     if held:
-        scored["held"] = score(model, join([renders(recording) for recording in held]))
-        figures |= located("held", scored["held"], threshold)
-        figures |= by_distance("held", scored["held"]) | reliability("held", scored["held"])
+        scored["held"] = score(model, join([load_renders(recording) for recording in held]))
+        figures |= compute_errors("held", scored["held"], threshold)
+        figures |= compute_recall_by_distance("held", scored["held"])
+        figures |= measure_reliability("held", scored["held"])
         alarmed = count_false_alarms(scored["held"], threshold)
         figures |= {"held.false_an_empty_image": alarmed.false_alarms}
     return figures, scored
 
 
 def draw_curves(scored: dict[str, ScoredDetections], out: Path) -> None:
-    """Draw the reliability of every set with labels."""
+    """Draw the reliability curve of every set with labels."""
     import matplotlib.pyplot as plt  # noqa: PLC0415 - only for the picture
 
     figure, axes = plt.subplots(figsize=(4.5, 4), layout="constrained")
@@ -257,14 +277,14 @@ def draw_curves(scored: dict[str, ScoredDetections], out: Path) -> None:
 
 
 def main() -> int:
-    """Print every figure beside its floor."""
+    """Print every figure with its limits; return 1 if one is outside them, else 0."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("model", type=Path)
     parser.add_argument("data", type=Path)
     parser.add_argument("--part", choices=("choose", "judge"), default="choose")
     parser.add_argument("--held", type=Path, action="append", default=[])
     parser.add_argument("--flights", type=int, default=0, metavar="N")
-    parser.add_argument("--floors", help="network of release_gate.toml; default: the model's name")
+    parser.add_argument("--floors", help="table of release_gate.toml; default: name of the model")
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--curve", type=Path)
     parser.add_argument("--calibrate", type=Path, metavar="OUT")
@@ -273,10 +293,10 @@ def main() -> int:
     given = parser.parse_args()
     path = resolve_model_path(given.model)
     model = load_model(path)
-    figures, scored = gate(model, given.data, given.part, given.held)
+    figures, scored = compute_figures(model, given.data, given.part, given.held)
     if given.flights:
         figures |= fly(path, given.part, given.flights)
-    if given.renders_only:  # a network for the published renders: real frames are no matter
+    if given.renders_only:  # for a network that only has to work on the published renders
         scored.pop("composites_and_empty", None)
     if given.calibrate:
         calibrate(model, scored, given.calibrate, anew=given.threshold_anew)
@@ -290,11 +310,11 @@ def main() -> int:
         bad = given.part == "judge" and not low <= value <= high
         failed += [key] * bad
         limits = f"{low:g} to {high:g}" if key in floors else ""
-        rows.append((key, f"{value:.3f}", limits, "below its floor" if bad else ""))
+        rows.append((key, f"{value:.3f}", limits, "outside its limits" if bad else ""))
     if given.json:
         json.dump({k: float(v) for k, v in figures.items()}, sys.stdout, indent=1)
     else:
-        print_table(f"{name}, {given.part}", ("figure", "value", "floor", ""), rows)
+        print_table(f"{name}, {given.part}", ("figure", "value", "limits", ""), rows)
     return 1 if failed else 0
 
 

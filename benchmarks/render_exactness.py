@@ -1,4 +1,4 @@
-"""How exact renders are: edges against boxes, and the grain of few samples."""
+"""Measure the accuracy of boxes in renders, and the noise of renders with few samples."""
 
 import tempfile
 from dataclasses import replace
@@ -23,17 +23,17 @@ from dmrl.terminal.progress import say
 MANY_SAMPLES = 512
 
 
-def mesh_box(camera: Camera, pose: Pose, points: Array) -> Array:
-    """Left, top, right, bottom of a mesh's corners in the image, clipped to it.
+def project_box(camera: Camera, pose: Pose, points: Array) -> Array:
+    """Return left, top, right and bottom of a projected mesh, pixels, clipped to the image.
 
     Parameters
     ----------
     camera
-        Takes the image.
+        Camera.
     pose
-        Of the robot.
+        Pose of the robot.
     points
-        (N, 3) corners, body frame.
+        (N, 3) vertices, body frame, metres.
     """
     xyz = points @ pose.camera_from_body.T + pose.xyz_camera
     uv, _ = project(xyz[xyz[:, 0] > 0.01], camera.image_from_optical)
@@ -42,15 +42,17 @@ def mesh_box(camera: Camera, pose: Pose, points: Array) -> Array:
     return np.clip(box, 0, (camera.width_px, camera.height_px) * 2)
 
 
-def reprojection(recipe: str, images: int) -> dict[str, float]:
-    """Distance of alpha boxes' edges from the mesh's, pixels, robots that nothing hides.
+def measure_reprojection(recipe: str, images: int) -> dict[str, float]:
+    """Measure the errors of box edges in renders against the projected mesh, pixels.
+
+    Only robots that are fully visible count.
 
     Parameters
     ----------
     recipe
-        Preset to draw from.
+        Name of the preset.
     images
-        How many.
+        Number of images.
     """
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "recipe.toml"
@@ -68,7 +70,7 @@ def reprojection(recipe: str, images: int) -> dict[str, float]:
             renderer.load_panorama,
             None,
         )
-        world = replace(world, panorama=grey)
+        world = replace(world, panorama=build_grey_panorama)
         scenes = [draw_scene(world, k) for k in range(images)]
         shots = renderer.render_shots((camera, scene.robots, scene.look) for scene in scenes)
         for scene, shot in zip(scenes, shots, strict=True):
@@ -77,7 +79,7 @@ def reprojection(recipe: str, images: int) -> dict[str, float]:
                     continue
                 turn = (robot.paint["rotor_first_rad"], robot.paint["rotor_sweep_rad"])
                 points = crazyflie.outline_points(settings.scale, *turn)
-                box = mesh_box(camera, robot.pose, points)
+                box = project_box(camera, robot.pose, points)
                 errors.append(shot.box_px[k] - box)
                 middles.append((shot.box_px[k] - box).reshape(2, 2).mean(axis=0))
     edges = np.array(errors)
@@ -95,18 +97,18 @@ def reprojection(recipe: str, images: int) -> dict[str, float]:
     }
 
 
-def grain(recipe: str, images: int, backgrounds: Path) -> dict[str, float]:
-    """Measure the noise of light paths on robots, and the sensor's own, grey levels of 256.
+def measure_noise(recipe: str, images: int, backgrounds: Path) -> dict[str, float]:
+    """Measure the noise of few light paths on robots, and that of the sensor, grey levels of 256.
 
-    Standard deviations, over pixels that a robot covers wholly, of the difference from a picture
-    of many paths; the sensor is noiseless but where its noise is told.
+    The noise is the standard deviation of the difference from an image with many paths, over pixels
+    that a robot covers fully. The sensor has no noise, except for the figure of the sensor.
 
     Parameters
     ----------
     recipe
         Name of a recipe.
     images
-        How many.
+        Number of images.
     backgrounds
         Folder of photos.
     """
@@ -118,30 +120,35 @@ def grain(recipe: str, images: int, backgrounds: Path) -> dict[str, float]:
         model = RobotModel(None, settings.scale)
         with Renderer(ensure_environment(say), model, workers=1, samples=samples) as renderer:
             world = SceneSource(
-                settings, camera, renderer.radius_m, tuple(renderer.lights), grey, photos
+                settings,
+                camera,
+                renderer.radius_m,
+                tuple(renderer.lights),
+                build_grey_panorama,
+                photos,
             )
             drawn = [draw_scene(world, k) for k in range(images)]
-            calm = [replace(d.look, sensor=_noiseless(d.look.sensor)) for d in drawn]
+            calm = [replace(d.look, sensor=_without_noise(d.look.sensor)) for d in drawn]
             scenes = [(camera, d.robots, look) for d, look in zip(drawn, calm, strict=True)]
             shots[f"paths_{samples}"] = list(renderer.render_shots(scenes))
             if samples == MANY_SAMPLES:
                 noisy = [(camera, d.robots, d.look) for d in drawn]
                 shots["sensor"] = list(renderer.render_shots(noisy))
     exact = shots.pop(f"paths_{MANY_SAMPLES}")
-    return {name: _difference(found, exact) for name, found in shots.items()}
+    return {name: _measure_difference(found, exact) for name, found in shots.items()}
 
 
-def grey(name: str) -> Panorama:
-    """Return a panorama of nothing."""
+def build_grey_panorama(name: str) -> Panorama:
+    """Return a uniform grey panorama."""
     return Panorama(np.full((8, 16, 3), 0.3, np.float32))
 
 
-def _noiseless(sensor: Sensor) -> Sensor:
+def _without_noise(sensor: Sensor) -> Sensor:
     return replace(sensor, shot_noise=0.0, read_noise=0.0)
 
 
-def _difference(found: list[Shot], exact: list[Shot]) -> float:
-    """Return the standard deviation where a robot covers pixels wholly."""
+def _measure_difference(found: list[Shot], exact: list[Shot]) -> float:
+    """Return the standard deviation of the difference where a robot covers pixels fully."""
     apart = [
         (one.rgb.astype(float) - other.rgb)[(other.opacity == 255).any(axis=0)].ravel()
         for one, other in zip(found, exact, strict=True)

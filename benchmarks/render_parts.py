@@ -1,4 +1,4 @@
-"""CPU time of a render's parts: Cycles, the rest of Blender's process, and dmrl's process."""
+"""Measure the CPU time of a render in Cycles, in the rest of Blender, and in dmrl's process."""
 
 import os
 import resource
@@ -17,18 +17,19 @@ PARTS = ("cycles", "rest_of_blender", "dmrl")
 
 
 def measure_parts(recipe: str, images: int, rounds: int) -> dict[str, object]:
-    """Measure the CPU time of an image's parts, ms, with one worker and without the start.
+    """Measure the CPU time per image of each part, ms, with one worker and without start-up.
 
-    Of dmrl's process, a run of few images is subtracted; of Blender's, its first images.
+    The start-up is removed by subtracting a run with few images; Blender's first images of each run
+    are left out as well.
 
     Parameters
     ----------
     recipe
         Name of a recipe.
     images
-        How many more images the longer run has.
+        Number of images that the longer run has in addition.
     rounds
-        How many rounds. Lists have one number of each.
+        Number of rounds; the lists have one number per round.
     """
     found = np.array([_render(recipe, FEW + images) - _render(recipe, FEW) for _ in range(rounds)])
     each = found / images * 1e3
@@ -39,7 +40,7 @@ def measure_parts(recipe: str, images: int, rounds: int) -> dict[str, object]:
 
 
 def _render(recipe: str, images: int) -> np.ndarray:
-    """Return the CPU seconds of the parts of a run."""
+    """Render some images; return the CPU seconds of the three parts."""
     shipped = worker_pool.WORKER_SCRIPT
     with tempfile.TemporaryDirectory() as folder:
         times = Path(folder) / "times"

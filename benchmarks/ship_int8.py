@@ -1,9 +1,10 @@
-"""Quantise the shipped networks again, and put the int8 networks beside their weights.
+"""Quantise the shipped networks, and store the int8 networks beside their weights.
 
-python benchmarks/ship_int8.py [RECORDING ...]: the images of the recordings and of 400 drawings by
-`dmrl sketch` set the ranges of the activations. Run it when a shipped network has changed
-(`make int8`).
-A test fails if an int8 network is not of the weights beside it.
+    python benchmarks/ship_int8.py [RECORDING ...]
+
+The activation ranges come from the images of the recordings and from 400 drawings of `dmrl sketch`.
+Run this, or `make int8`, when a shipped network has changed. A test fails if an int8 network does
+not belong to the weights beside it.
 """
 
 import json
@@ -18,7 +19,7 @@ from dmrl.deploy.samples import SAMPLES_NAME, save_samples
 from dmrl.learn.pretrained import PRETRAINED_DIR, list_pretrained
 
 SAMPLES = 1
-"""Drawings that ship with each network, as vectors of the self-test of its C."""
+"""Number of drawings that ship with each network, as inputs of the self-test of its C."""
 
 
 def draw(folder: Path) -> Path:

@@ -1,11 +1,11 @@
-"""A simulated evening: many tasks on many nodes, some of them slow, some of them dying.
+"""Simulate the schedule of many tasks on many nodes, of which some are slow and some die.
 
     python benchmarks/sim_schedule.py [--tasks 10000] [--nodes 32] [--cores 16] [--seeds 5]
 
-Rules are those of `dmrl --on ray`: the largest inputs first, one task a core, a task of a node that
-dies is begun again at most five times, and one driver hands tasks out, one after the other. Its
-assumptions are options. The seconds of a task are by `bench_items.py` (docs/scale.md); what handing
-one out costs is measured by `bench_cluster.py`. How often nodes are slow or die is assumed.
+The rules are those of `dmrl --on ray`. The largest inputs start first, each core runs one task, and
+a task of a dead node is restarted at most five times. One driver submits the tasks one by one. The
+assumptions are options. The seconds per task come from `bench_items.py` (docs/scale.md), and the
+cost of submitting one from `bench_cluster.py`. How often nodes are slow or die is assumed.
 """
 
 import argparse
@@ -21,24 +21,24 @@ MOST_DEATHS = 5
 
 @dataclass(frozen=True, slots=True)
 class World:
-    """What is assumed.
+    """Assumptions of a simulation.
 
     Parameters
     ----------
     tasks, nodes, cores
-        How many; cores of a node.
+        Number of tasks, of nodes, and of cores per node.
     task_s
-        Mean seconds of CPU of a task.
+        Mean CPU seconds of a task.
     spread
-        Standard deviation over the mean, log-normal.
+        Standard deviation of the task times over their mean; they are log-normal.
     overhead_s
-        Of the driver, for each task: nobody else is served meanwhile.
+        Seconds that the driver needs to submit a task; it submits one at a time.
     slow_share, slow_times
-        Share of nodes that are slow, and how many times longer they take.
+        Share of slow nodes, and the factor by which they take longer.
     node_life_h, away_h
-        Mean hours until a node dies, and for how long it is away. 0: none dies.
+        Mean hours until a node dies, and the hours until it returns. 0: no node dies.
     by_size
-        Largest first; else as they come.
+        Start the largest tasks first; else in random order.
     """
 
     tasks: int
@@ -55,8 +55,8 @@ class World:
 
 
 @dataclass(frozen=True, slots=True)
-class Evening:
-    """What came of it: hours, share of the cores' time that was of use, deaths, losses."""
+class Outcome:
+    """Hours until the end, used share of the cores' time, restarts, and lost tasks."""
 
     hours: float
     used: float
@@ -64,11 +64,11 @@ class Evening:
     lost: int
 
 
-def simulate(world: World, seed: int) -> Evening:
-    """One evening.
+def simulate(world: World, seed: int) -> Outcome:
+    """Simulate one schedule.
 
     Events are the ends of tasks and the deaths and returns of nodes, in order of time. A death ends
-    what runs on the node; its tasks wait in front, as they have waited longest.
+    the tasks of the node; they are restarted before all others.
     """
     rng = np.random.default_rng(seed)
     sigma = np.sqrt(np.log1p(world.spread**2))
@@ -76,7 +76,7 @@ def simulate(world: World, seed: int) -> Evening:
     slow = rng.random(world.nodes) < world.slow_share
     pace = np.where(slow, world.slow_times, 1.0)
     waiting = list(np.argsort(work_s) if world.by_size else np.arange(world.tasks)[::-1])
-    ended: list[tuple[float, int]] = []  # by a death, and when
+    ended: list[tuple[float, int]] = []  # times of death, and tasks that they ended
     free = [(0.0, node) for node in range(world.nodes) for _ in range(world.cores)]
     deaths = [np.inf] * world.nodes
     if world.node_life_h:
@@ -90,7 +90,7 @@ def simulate(world: World, seed: int) -> Evening:
         if not waiting:
             heapq.heappush(free, (ended[0][0], node))
             continue
-        if now_s >= deaths[node]:  # it is away, and comes back
+        if now_s >= deaths[node]:  # the node is dead, and returns later
             back_s = deaths[node] + 3600 * world.away_h
             if now_s < back_s:
                 heapq.heappush(free, (back_s, node))
@@ -111,11 +111,11 @@ def simulate(world: World, seed: int) -> Evening:
         end_s = max(end_s, done_s)
         heapq.heappush(free, (done_s, node))
     used = work_s.sum() / (end_s * world.nodes * world.cores)
-    return Evening(end_s / 3600, float(used), again, lost)
+    return Outcome(end_s / 3600, float(used), again, lost)
 
 
 def main() -> None:
-    """Print a table: kinds of evenings, means over seeds and the worst."""
+    """Print a row for each scenario: means over seeds, and the worst."""
     parser = argparse.ArgumentParser(description=__doc__)
     for name, value in (("tasks", 10_000), ("nodes", 32), ("cores", 16), ("seeds", 5)):
         parser.add_argument(f"--{name}", type=int, default=value)
@@ -128,12 +128,12 @@ def main() -> None:
     }
     slow, dying = {"slow_share": 0.1, "slow_times": 3.0}, {"node_life_h": 12.0}
     kinds = {
-        "calm": {},
-        "calm, as they come": {"by_size": False},
-        "one node in ten 3 times slower": slow,
+        "no faults": {},
+        "no faults, random order": {"by_size": False},
+        "one node in ten takes 3 times as long": slow,
         "a node dies every 12 h, away 15 min": dying,
         "both": slow | dying,
-        "both, as they come": slow | dying | {"by_size": False},
+        "both, random order": slow | dying | {"by_size": False},
         "both, a node dies every hour": slow | {"node_life_h": 1.0},
     }
     rows = []
@@ -144,7 +144,7 @@ def main() -> None:
         again = np.mean([one.again for one in found])
         lost = sum(one.lost for one in found)
         rows.append((name, np.mean(hours), max(hours), f"{used:.1%}", again, lost))
-    heads = ("evening", "h", "worst h", "used", "begun again", "lost in all")
+    heads = ("scenario", "hours", "worst hours", "cores used", "restarts", "tasks lost in all runs")
     print_table(f"{given.tasks} tasks, {given.nodes} x {given.cores} cores", heads, rows)
 
 

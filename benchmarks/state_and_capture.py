@@ -1,8 +1,8 @@
-"""What a Crazyflie took its state for, and where motion capture saw it: a picture.
+"""Plot the state estimate of a Crazyflie and its motion capture.
 
 python benchmarks/state_and_capture.py REC.mcap OUT.png [ROBOT]
 
-REC.mcap comes from ``dmrl convert`` of a micro-SD log with ``locSrv`` in it.
+REC.mcap comes from ``dmrl convert`` of a micro-SD log with the ``locSrv`` variables.
 """
 
 import sys
@@ -18,7 +18,7 @@ COLOURS = ("#c0392b", "#1e8449", "#2471a3")
 
 
 def poses(recording: Path, topic: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return times (N,) s, places (N, 3) m, and roll, pitch, yaw (N, 3) degrees."""
+    """Return times (N,), s, positions (N, 3), m, and roll, pitch, yaw (N, 3), degrees."""
     table = read_table(recording, topic)
     rows = table["pose"].to_pylist()
     place = np.array([[row["position"][n] for n in "xyz"] for row in rows])
@@ -28,7 +28,7 @@ def poses(recording: Path, topic: str) -> tuple[np.ndarray, np.ndarray, np.ndarr
 
 
 def main(recording: str, out: str, robot: str = "cf1") -> None:
-    """Write the picture; print median and largest distance."""
+    """Write the picture; print the median and largest distance."""
     time, state, angles = poses(Path(recording), f"/{robot}/pose")
     true_time, truth, true_angles = poses(Path(recording), f"/{robot}/pose/truth")
     start = time[0]
@@ -43,7 +43,7 @@ def main(recording: str, out: str, robot: str = "cf1") -> None:
         place.plot(true_time - start, truth[:, k], "k:", lw=1.5)
         turn.plot(time - start, angles[:, k], color=COLOURS[k], label=f"{angle}, state")
         turn.plot(true_time - start, true_angles[:, k], "k:", lw=1.5)
-    # Motion capture's velocity in the robot's horizontal frame, by central differences.
+    # Velocity from motion capture in the robot's horizontal frame, by central differences.
     window = 5
     kernel = np.ones(window) / window
     yaw = np.radians(true_angles[:, 2])

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""dmrl's Blender worker that also tells how long rendering took: run in Blender's Python.
+"""dmrl's Blender worker with times of rendering, run in Blender's Python.
 
-DMRL_RENDER_TIMES names a file. Each image adds a line of two numbers: CPU seconds of this process
-so far, and of bpy.ops.render.render in it: Cycles, and Blender's update of the scene and its BVH.
+DMRL_RENDER_TIMES names a file. Each image adds a line with two numbers: the CPU seconds of this
+process so far, and those of bpy.ops.render.render in it. The latter include Cycles, Blender's
+update of the scene, and its BVH.
 """
 
 import os

@@ -1,1 +1,1 @@
-"""Judge of `dmrl label`: flights with known faults, and the figures of what comes out."""
+"""Evaluation of `dmrl label`: flights with known faults, and figures of their labels."""

@@ -1,6 +1,7 @@
-"""Faults that are injected into the recordings of sound flights, from outside of every model.
+"""All faults that are injected into recordings of sound flights.
 
-Signals, sizes and seeds were fixed on 25 November 2026, before labels by evidence were tuned.
+Signals, sizes and seeds were fixed on 25 November 2026, before model selection by evidence was
+tuned.
 """
 
 from label_judge.flow_rows import FLOW_ROWS
@@ -10,4 +11,4 @@ from label_judge.range_rows import RANGE_ROWS
 from label_judge.yaw_rows import YAW_ROWS
 
 ROWS: tuple[Row, ...] = (*YAW_ROWS, *FLOW_ROWS, *RANGE_ROWS, *OTHER_ROWS)
-"""Faults of the table."""
+"""All faults of the table."""

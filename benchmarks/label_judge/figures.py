@@ -1,4 +1,4 @@
-"""Figures of labelled flights, and of a row of the judge's table over its flights."""
+"""Figures of a labelled flight, and of a row of the table over its flights."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -15,7 +15,7 @@ from label_judge.flights import Array
 
 BAD_M, CHI2_95 = 0.3, 5.991
 REFUSED_SHARE = 0.01
-"""A flight of which less is kept counts as refused."""
+"""A flight with a smaller share of kept positions counts as refused."""
 
 
 @dataclass(frozen=True)
@@ -25,21 +25,22 @@ class FlightFigures:
     Parameters
     ----------
     positions, expected
-        Number of positions with truth; and of true positions, where nothing was written.
+        Number of positions with truth, and number of true positions.
     squared_error, squared_sigma, squared_bound
-        Sums, m^2; the bound's is NaN where it is not known.
+        Sums, m^2; that of the bound is NaN if it is unknown.
     worst_pair_m
         Largest RMSE of an observer and its peer.
     inside, kept, bad
-        Number in the 95 % ellipse; with status OK; of these, over 0.3 m off.
+        Number of positions in the 95 % ellipse; with status OK; of these, with an error over 0.3 m.
     keepable
-        By bad share: number that a smoother with the bound's covariances could keep.
+        By bad share: number of positions that a smoother with the covariances of the bound could
+        keep.
     named, said
-        Causes that the labels name, with a probability of 0.5 or more; else the lines printed.
+        Causes with a probability of 0.5 or more in the labels; and the warnings printed.
     error
-        The line with which the command failed, or "".
+        The error with which the command failed, or "".
     cpu_s
-        CPU seconds, start-up shared by the recordings of the folder.
+        CPU seconds; the start-up is shared among the recordings of the folder.
     """
 
     positions: int = 0
@@ -61,16 +62,16 @@ class FlightFigures:
 def judge_flight(
     labelled: Path, beside: Path | None, result: Mapping[str, Any], moving: Sequence[str] = ()
 ) -> FlightFigures:
-    """Judge one flight.
+    """Compute the figures of one labelled flight.
 
     Parameters
     ----------
     labelled
         Recording with estimates and truth; it may not exist.
     beside
-        File with the bound's covariances.
+        File with the covariances of the bound; None if there is none.
     result
-        What `dmrl label --json` said of it.
+        Its entry in the output of `dmrl label --json`.
     moving
         Only pairs of these robots count. Empty: all.
     """
@@ -127,7 +128,7 @@ def _mahalanobis_squared(error: Array, covariance: Array) -> Array:
 
 
 def _find_words(result: Mapping[str, Any]) -> dict[str, str]:
-    """Return the causes that the labels name, or the lines of earlier states."""
+    """Return the probable causes, the warnings and the error of a flight, each as one text."""
     inner = result.get("result") or {}
     causes = [cause for pair in inner.get("pairs", ()) for cause in pair.get("causes") or ()]
     sure = [c for c in causes if c.get("probability", 1.0) >= 0.5]
@@ -142,12 +143,12 @@ def _find_words(result: Mapping[str, Any]) -> dict[str, str]:
 
 @dataclass(frozen=True)
 class RowFigures:
-    """Figures of a row: roots of means of squares over flights, shares of all positions.
+    """Figures of a row: root mean squares over flights, and shares of all positions.
 
-    ``median_m``, ``ratio`` and ``least_ellipse`` are the median RMSE of a flight, its median over
-    the bound, and the least share in the ellipse; ``worst_kept_m`` is the largest RMSE of a flight
-    of which anything is kept. ``near`` is the share of flights in which the words name the cause;
-    where there is none, that in which a cause is named all the same.
+    ``median_m`` and ``ratio`` are medians over flights of the RMSE, and of the RMSE over the bound.
+    ``least_ellipse`` is the smallest share of a flight in the ellipse, and ``worst_kept_m`` the
+    largest RMSE of a flight that keeps any position. ``near`` is the share of flights whose causes
+    or warnings name the cause. If there is no cause, it is the share that names one nevertheless.
     """
 
     flights: int
@@ -179,11 +180,11 @@ def combine(
     Parameters
     ----------
     flights
-        Figures of each.
+        Figures of each flight.
     cause
-        Pattern of words that name what is wrong.
+        Regular expression that matches a correct name of the cause.
     sound
-        The same flights without the fault.
+        Figures of the same flights without the fault.
     """
     made = [f for f in flights if f.positions]
     positions, expected = sum(f.positions for f in made), sum(f.expected for f in flights)
@@ -195,7 +196,7 @@ def combine(
 
     keepable = sum((f.keepable or {}).get("0.02", 0.0) for f in flights)
     sound_kept = sum(f.kept for f in sound)
-    # Until labels have causes, their lines count, and the line of a refusal.
+    # Labels without causes, as of older versions, count by their warnings or their error.
     words = [f.named or f.said or f.error for f in flights]
     near = [re.search(cause, w, re.IGNORECASE) is not None for w in words]
     if not cause:

@@ -1,4 +1,4 @@
-"""Flights of two robots as arrays that a fault may change, and their recordings."""
+"""Simulated flights of two robots as arrays, which faults may change, and their recordings."""
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
@@ -25,12 +25,12 @@ Pair = tuple[str, str]
 BOTH: tuple[Pair, Pair] = (("cf1", "cf2"), ("cf2", "cf1"))
 MOTIONS = ("in_view", "room", "random")
 HOPS = "hops"
-"""Motion of the judge's own: rests in a room of 4 x 4 m, and hops between them, up to 4 m/s."""
+"""A trajectory that only this benchmark has: rests and hops in a room of 4 x 4 m, up to 4 m/s."""
 TRUTH_HZ = 20.0
 
 
 def hop(rng: np.random.Generator, start: Start, _leader: Motion | None) -> Motion:
-    """Return the motion of a robot that rests and hops, with the least jerk, and turns."""
+    """Return the motion of a robot that rests, and hops and turns along minimum-jerk paths."""
     time_s = np.arange(start.samples) / 100
     position, velocity = np.zeros((2, start.samples), complex)
     yaw_rate = np.zeros(start.samples)
@@ -54,23 +54,23 @@ TRAJECTORIES[HOPS] = (hop, hop)  # type: ignore[index]
 
 @dataclass
 class Logs:
-    """What a recording of a flight will hold, on the clocks of its robots, seconds.
+    """Contents of a recording; all times are on the clocks of the robots, seconds.
 
     Parameters
     ----------
     robots
-        By robot: ``time_s`` and the columns of its log, (N,) each; NaN where it is silent.
+        By robot: ``time_s`` and the columns of its log, (N,) each; NaN during dropouts.
     ranges
-        By (robot that ranges, robot that answers): (2, M) times and ranges.
+        By (measuring robot, answering robot): (2, M) times and ranges.
     truth
         By (observer, peer): (N, 4) times and x, y, z in the observer's horizontal frame.
     bound
-        By (observer, peer): (N, 2, 2) least covariances at the times of the truth; empty with
-        cameras.
+        By (observer, peer): (N, 2, 2) smallest possible covariances at the times of the truth.
+        Empty with cameras.
     flight
-        The flight, for faults that depend on the true motion.
+        The simulated flight, for faults that depend on the true motion.
     detections
-        By robot: times of images, and of each the rows u, v, depth, confidence.
+        By robot: times of images, and for each the rows (u, v, depth, confidence).
     """
 
     robots: dict[str, dict[str, Array]]
@@ -82,7 +82,7 @@ class Logs:
 
     @property
     def end_s(self) -> float:
-        """Length of the flight, seconds."""
+        """Return the length of the flight, seconds."""
         return float(self.flight.truth["cf1"].time_s[-1])
 
 
@@ -95,7 +95,7 @@ class Base:
     motion, noise, duration_s, seed
         As in `dmrl fly`.
     faults
-        Faults of motion, which the simulator makes: landings and crashes.
+        Landings and crashes, which the simulator flies.
     """
 
     motion: str
@@ -106,7 +106,7 @@ class Base:
 
     @property
     def settings(self) -> FlySettings:
-        """The recipe of `dmrl fly`."""
+        """Return the settings of `dmrl fly` for this flight."""
         return FlySettings(
             duration_s=self.duration_s,
             trajectory=self.motion,  # type: ignore[arg-type]
@@ -136,7 +136,7 @@ def _fly(base: Base) -> tuple[Flight, dict[Pair, Array], dict[Pair, Array]]:
 
 
 def fly(base: Base) -> Logs:
-    """Fly once; return fresh arrays, free to change."""
+    """Simulate a flight once; return new arrays each time, which the caller may change."""
     flight, truth, bound = _fly(base)
     robots = {
         name: {key: getattr(log, key).copy() for key in ("time_s", *LOG_COLUMNS)}
@@ -148,7 +148,7 @@ def fly(base: Base) -> Logs:
 
 
 def write(logs: Logs, base: Base, what: Mapping[str, Any], path: Path) -> None:
-    """Write a recording as `dmrl fly` would, and the bound beside it (.npz)."""
+    """Write a recording like that of `dmrl fly`, and the bound beside it (.npz)."""
     settings = {**asdict(base.settings), "injected": dict(what)}
     with RecordingWriter(path, Provenance("fly", settings, base.seed), recipe="") as sink:
         for robot, columns in logs.robots.items():
@@ -188,7 +188,7 @@ def _write_log(sink: RecordingWriter, robot: str, columns: Mapping[str, Array]) 
 def _write_columns(
     sink: RecordingWriter, topic: str, message: str, time_s: Array, **fields: Array
 ) -> None:
-    """Write the rows in which everything is known, in the order of time."""
+    """Write the rows without NaN, in order of time."""
     if not len(time_s):
         return
     good = np.all([np.isfinite(v).reshape(len(time_s), -1).all(axis=1) for v in fields.values()], 0)
@@ -207,18 +207,18 @@ def _write_detections(sink: RecordingWriter, robot: str, at_s: float, rows: Arra
 
 @dataclass(frozen=True)
 class Eye:
-    """A detector on every robot: 10 images a second.
+    """Errors of the detectors of the robots, which process 10 images per second.
 
     Parameters
     ----------
     pixel_px, depth_share, missed
-        Noise of u and v, of the depth, and the share of peers in view that are not found.
+        Standard deviation of u and v, of the relative depth, and the share of missed peers.
     wrong
-        Share of images with a detection of nothing.
+        Share of images with a false detection.
     lasting_share, lasting_s
-        Standard deviation and time constant of a depth error that lasts.
+        Standard deviation and time constant of a correlated relative depth error.
     unseen_share
-        Share of the time in which the peer is not found for seconds.
+        Share of spans of ``lasting_s`` in which the peer is never found.
     """
 
     pixel_px: float = 2.0
@@ -231,7 +231,7 @@ class Eye:
 
 
 def look(logs: Logs, eye: Eye, rng: np.random.Generator) -> Logs:
-    """Give every robot the detections that its camera would bring."""
+    """Add simulated detections of the camera of every robot."""
     flight = logs.flight
     for robot, peer in BOTH:
         true_s = np.arange(0.05, logs.end_s, 0.1)
@@ -258,7 +258,7 @@ def look(logs: Logs, eye: Eye, rng: np.random.Generator) -> Logs:
 
 
 def draw_walk(rng: np.random.Generator, time_s: Array, tau_s: float) -> Array:
-    """Draw (N,) stationary noise of unit size that fades over a time constant."""
+    """Draw (N,) samples of a stationary Ornstein-Uhlenbeck process of unit variance."""
     keep = np.exp(-(time_s[1] - time_s[0]) / tau_s)
     out = rng.normal(0.0, 1.0, len(time_s))
     for k in range(1, len(out)):
@@ -267,6 +267,6 @@ def draw_walk(rng: np.random.Generator, time_s: Array, tau_s: float) -> Array:
 
 
 def draw_spans(rng: np.random.Generator, time_s: Array, length_s: float) -> Array:
-    """Draw (N,) numbers in (0, 1) that are constant over spans of time."""
+    """Draw (N,) uniform numbers in (0, 1) that are constant over spans of ``length_s``."""
     index = ((time_s - time_s[0]) / length_s).astype(int)
     return np.asarray(rng.random(index[-1] + 1)[index])

@@ -33,18 +33,18 @@ def turn_flow(logs: Logs, robot: str, angle: Array | float) -> None:
 
 
 def rotate_flow(logs: Logs, size: float, rng: np.random.Generator) -> None:
-    """Mount the flow sensor askew."""
+    """Turn the velocities by an angle, as of a flow sensor that is mounted askew."""
     turn_flow(logs, PEER, size)
 
 
-def flow_in_world(logs: Logs, size: float, rng: np.random.Generator) -> None:
-    """Give velocities in the world's frame, not in the robot's."""
+def put_flow_in_world(logs: Logs, size: float, rng: np.random.Generator) -> None:
+    """Express velocities in the world frame in place of the horizontal frame of the robot."""
     truth = logs.flight.truth[PEER]
     turn_flow(logs, PEER, np.interp(logs.robots[PEER]["time_s"], truth.time_s, truth.yaw))
 
 
-def flow_from_take_off(logs: Logs, size: float, rng: np.random.Generator) -> None:
-    """Give velocities in the frame of take-off, turned by the yaw since then."""
+def put_flow_in_take_off(logs: Logs, size: float, rng: np.random.Generator) -> None:
+    """Express velocities in the horizontal frame that the robot had at take-off."""
     truth = logs.flight.truth[PEER]
     yaw = truth.yaw - truth.yaw[0]
     turn_flow(logs, PEER, np.interp(logs.robots[PEER]["time_s"], truth.time_s, yaw))
@@ -56,8 +56,8 @@ def swap_axes(logs: Logs, size: float, rng: np.random.Generator) -> None:
     log[VX], log[VY] = log[VY], log[VX]
 
 
-def late_flow(logs: Logs, size: float, rng: np.random.Generator) -> None:
-    """Report the flow of one robot late."""
+def delay_flow(logs: Logs, size: float, rng: np.random.Generator) -> None:
+    """Delay the velocities of one robot."""
     log = logs.robots[PEER]
     for name in (VX, VY):
         log[name] = delay(log[name], log["time_s"], size)
@@ -169,8 +169,8 @@ FLOW_ROWS = (
     Row("vy negated", flow(PEER, lambda v, t, g, s, r: -v, VY), 0.0, FLOW, PEER),
     Row("vx negated", flow(OWN, lambda v, t, g, s, r: -v, VX), 0.0, FLOW, OWN),
     Row("vx and vy swapped", swap_axes, 0.0, FLOW, PEER),
-    Row("velocity in the world frame", flow_in_world, 0.0, FLOW + "|frame|world", PEER),
-    Row("velocity in the take-off frame", flow_from_take_off, 0.0, FLOW + "|frame|world", PEER),
+    Row("velocity in the world frame", put_flow_in_world, 0.0, FLOW + "|frame|world", PEER),
+    Row("velocity in the take-off frame", put_flow_in_take_off, 0.0, FLOW + "|frame|world", PEER),
     Row("velocity in cm/s", flow(PEER, lambda v, t, g, s, r: 100 * v), 0.0, FLOW, PEER),
     Row(
         "flow saturates",
@@ -186,7 +186,7 @@ FLOW_ROWS = (
         FLOW,
         PEER,
     ),
-    Row("flow late", late_flow, 0.3, FLOW + "|" + CLOCK, PEER),
+    Row("flow late", delay_flow, 0.3, FLOW + "|" + CLOCK, PEER),
     Row("flow lags", flow(PEER, lambda v, t, g, s, r: filter_low(v, s)), 0.4, FLOW, PEER),
     Row(
         "flow follows the turning",

@@ -1,7 +1,7 @@
-"""Rows of faults, and the parts that they are made of.
+"""A row of the table of faults, and the functions from which faults are built.
 
-In the functions of rows, v is the signal, t its times in seconds, g the logs, s the size, r the
-random generator and k the link of a range.
+Arguments of the lambdas of rows: v is the signal, t its times in seconds, g the logs, s the size of
+the fault, r the random generator, and k the link of a range.
 """
 
 from collections.abc import Callable
@@ -23,22 +23,22 @@ MOTION = r"land|crash|still|lies|diverg|runs away"
 
 @dataclass(frozen=True)
 class Row:
-    """A fault of the table.
+    """A fault, one row of the table.
 
     Parameters
     ----------
     name
-        Its words in the table.
+        Name of the row.
     inject
-        Changes the logs in place, by a size.
+        Function that changes the logs in place by a given size.
     size
-        In the unit of the fault; 0 where a fault has none, as a sign.
+        Size in the unit of the fault; 0 for faults without a size, such as a wrong sign.
     cause
-        Pattern of words that name what is wrong; empty where nothing that matters is.
+        Regular expression that matches a correct name of the cause; empty for harmless changes.
     robot
-        Robot whose sensor is wrong, or "" for a pair's.
+        Robot with the wrong sensor, or "" if it is an error of the pair.
     motion
-        A landing or a crash, which the simulator makes.
+        A landing or a crash, which the simulator flies.
     """
 
     name: str
@@ -50,12 +50,12 @@ class Row:
 
     @property
     def shrunk(self) -> "Row":
-        """The fault at a third of its size."""
+        """Return the fault at a third of its size."""
         return replace(self, name=f"{self.name}, a third", size=self.size / 3)
 
 
 def column(robot: str, *names: str) -> Callable[[Callable[..., Array]], Injector]:
-    """Make an injector of a function that maps (value, time_s, logs, size, rng) to a value."""
+    """Return a decorator for functions that map (value, time_s, logs, size, rng) to a value."""
 
     def wrap(change: Callable[..., Array]) -> Injector:
         def inject(logs: Logs, size: float, rng: np.random.Generator) -> None:
@@ -69,7 +69,7 @@ def column(robot: str, *names: str) -> Callable[[Callable[..., Array]], Injector
 
 
 def links(*pairs: tuple[str, str]) -> Callable[[Callable[..., Array]], Injector]:
-    """Make an injector of a function that maps (range_m, time_s, logs, size, rng, link)."""
+    """Return a decorator for functions that map (range_m, time_s, logs, size, rng, link)."""
 
     def wrap(change: Callable[..., Array]) -> Injector:
         def inject(logs: Logs, size: float, rng: np.random.Generator) -> None:
@@ -84,35 +84,35 @@ def links(*pairs: tuple[str, str]) -> Callable[[Callable[..., Array]], Injector]
 
 
 def select_part(time_s: Array, logs: Logs, *parts: tuple[float, float]) -> Array:
-    """Return (N,) 1 in these parts of the flight, 0 elsewhere."""
+    """Return (N,) 1 in these parts of the flight, given as shares of its length, else 0."""
     share = time_s / logs.end_s
     return np.any([(share >= a) & (share < b) for a, b in parts], axis=0).astype(float)
 
 
 def ramp_up(time_s: Array, logs: Logs) -> Array:
-    """Return (N,) a ramp from 0 to 1 over the flight."""
+    """Return an (N,) ramp from 0 to 1 over the flight."""
     return np.asarray(np.clip(time_s / logs.end_s, 0.0, 1.0))
 
 
 def silence(at: Array) -> Array:
-    """Return (N,) NaN where a sensor is silent, else 0."""
+    """Return (N,) NaN where the mask is positive, else 0, to be added to a signal."""
     return np.where(at > 0, np.nan, 0.0)
 
 
 def select_seconds(time_s: Array, logs: Logs, seconds: float, *centres: float) -> Array:
-    """Return (N,) 1 in windows of so many seconds about these shares of the flight."""
+    """Return (N,) 1 in windows of so many seconds centred at these shares of the flight, else 0."""
     half = seconds / logs.end_s / 2
     return select_part(time_s, logs, *((c - half, c + half) for c in centres))
 
 
 def hold(value: Array, held: Array) -> Array:
-    """Repeat the value before each held stretch."""
+    """Replace held values by the last value before them."""
     index = np.where(held > 0, 0, np.arange(len(value)))
     return value[np.maximum.accumulate(index)]
 
 
 def delay(value: Array, time_s: Array, delay_s: float) -> Array:
-    """Return the value of some time ago."""
+    """Return the signal delayed by some seconds."""
     return np.interp(time_s - delay_s, time_s, value)
 
 
@@ -125,18 +125,18 @@ def filter_low(value: Array, tau_s: float) -> Array:
 
 
 def find_bearing(logs: Logs, link: tuple[str, str], time_s: Array) -> Array:
-    """Return (N,) true bearings of a peer, radians."""
+    """Return (N,) true bearings of the answering robot of a link, radians."""
     place = logs.flight.peer_in_horizontal(*link, time_s)
     return np.arctan2(place[:, 1], place[:, 0])
 
 
 def find_place(logs: Logs, robot: str, time_s: Array) -> Array:
-    """Return (N, 3) true places in the world, metres."""
+    """Return (N, 3) true positions of a robot in the world frame, metres."""
     return logs.flight.truth[robot].position_at(time_s)
 
 
 def draw_pulses(rng: np.random.Generator, count: int, number: int, size: float) -> Array:
-    """Draw (N,) zeros with pulses of one sample and random sign."""
+    """Draw (N,) zeros with some pulses of one sample and random sign."""
     out = np.zeros(count)
     out[rng.choice(count, number, replace=False)] = size * rng.choice([-1.0, 1.0], number)
     return out
@@ -147,31 +147,31 @@ YAW, VX, VY, H = "yaw_rate_radps", "vx_mps", "vy_mps", "height_m"
 
 
 def yaw(robot: str, change: Callable[..., Array]) -> Injector:
-    """Make an injector that changes a yaw rate."""
+    """Return an injector that changes the yaw rate of a robot."""
     return column(robot, YAW)(change)
 
 
 def flow(robot: str, change: Callable[..., Array], *names: str) -> Injector:
-    """Make an injector that changes the velocities, or one axis of them."""
+    """Return an injector that changes both velocities of a robot, or the named ones."""
     return column(robot, *(names or (VX, VY)))(change)
 
 
 def height(robot: str, change: Callable[..., Array]) -> Injector:
-    """Make an injector that changes a height."""
+    """Return an injector that changes the height of a robot."""
     return column(robot, H)(change)
 
 
 def ranges(change: Callable[..., Array], *pairs: tuple[str, str]) -> Injector:
-    """Make an injector that changes ranges, of both directions unless pairs are given."""
+    """Return an injector that changes ranges, of both directions unless links are given."""
     return links(*(pairs or BOTH))(change)
 
 
 def nothing(logs: Logs, size: float, rng: np.random.Generator) -> None:
-    """Change nothing: the simulator flew the fault."""
+    """Change nothing: for faults that the simulator flies."""
 
 
 def both(*injectors: tuple[Injector, float]) -> Injector:
-    """Inject several; the size scales all of them."""
+    """Return an injector of several faults with relative sizes."""
 
     def inject(logs: Logs, size: float, rng: np.random.Generator) -> None:
         for one, amount in injectors:

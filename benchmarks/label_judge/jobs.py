@@ -1,4 +1,4 @@
-"""Flights that the judge asks for: what is flown, what is injected, and how it is labelled."""
+"""Flights of the benchmark: motion, injected fault, and options of `dmrl label`."""
 
 import re
 import zlib
@@ -21,22 +21,22 @@ FIRST_SEED = {"sound": 7100, "faults": 8100, "thirds": 8100, "unlisted": 8600, "
 
 @dataclass(frozen=True)
 class Job:
-    """One flight to be labelled.
+    """One flight to label.
 
     Parameters
     ----------
     kind, row, noise, number
-        Set, words of the row, noise, and number of the flight in the row.
+        Set, name of the row, noise preset, and number of the flight in the row.
     base
-        The flight; None where it is a real one.
+        The simulated flight; None for a real one.
     fault
         Injected fault.
     eye, ranges
-        Detector, and whether ranges are in the recording.
+        Errors of the detectors, and whether the recording has ranges.
     options
-        Further flags of `dmrl label`.
+        Further options of `dmrl label`.
     cause
-        Pattern of words that name what is wrong.
+        Regular expression that matches a correct name of the cause.
     """
 
     kind: str
@@ -52,12 +52,12 @@ class Job:
 
     @property
     def key(self) -> str:
-        """Name of the flight's file."""
+        """Return the stem of the flight's files; it also seeds the fault."""
         row = re.sub(r"\W+", "-", self.row).strip("-")
         return f"{self.kind}-{row}-{self.noise}-{self.number}"
 
     def make(self, path: Path, data: Path | None) -> None:
-        """Write the flight."""
+        """Write the recording of the flight."""
         if self.base is None:
             assert data is not None
             real.write_real(self.row, self.number, data, path)
@@ -67,7 +67,7 @@ class Job:
             self.fault.inject(logs, self.fault.size, rng)
         if self.eye is not None:
             look(logs, self.eye, rng)
-            logs.bound = {}  # it knows of no cameras
+            logs.bound = {}  # the bound does not include detections
         if not self.ranges:
             logs.ranges.clear()
         write(logs, self.base, {"row": self.row}, path)
@@ -90,7 +90,7 @@ def list_sound(flights: int, noises: Sequence[str]) -> Iterator[Job]:
 
 
 def list_faults(kind: str, flights: int, noises: Sequence[str]) -> Iterator[Job]:
-    """Yield flights with one injected fault each, and the same without."""
+    """Yield flights with one injected fault each, and the same flights without a fault."""
     none = Row("none", lambda logs, size, rng: None, 0.0, "")
     rows = {"faults": ROWS, "unlisted": UNLISTED_ROWS}.get(
         kind, tuple(row.shrunk for row in ROWS if row.size)
@@ -112,7 +112,7 @@ EYES = {
 
 
 def list_eyes(flights: int, noises: Sequence[str]) -> Iterator[Job]:
-    """Yield flights in view with cameras."""
+    """Yield flights in view with camera detections."""
     for noise in noises:
         for name, (eye, ranges) in EYES.items():
             for k in range(flights):
@@ -124,20 +124,20 @@ def list_eyes(flights: int, noises: Sequence[str]) -> Iterator[Job]:
 def list_jobs(
     sets: Sequence[str], flights: int, noises: Sequence[str], only: str, data: Path | None
 ) -> list[Job]:
-    """List all flights that are asked for.
+    """Return the flights of some sets.
 
     Parameters
     ----------
     sets
         Some of `SETS`.
     flights
-        Number of each row.
+        Number of flights per row.
     noises
         Some of `NOISES`.
     only
-        Pattern of rows.
+        Regular expression that selects rows.
     data
-        Folder of real flights; without it, there are none.
+        Folder of real flights; None: no real flights.
     """
     jobs: list[Job] = []
     for kind in sets:
@@ -158,7 +158,7 @@ def list_jobs(
 
 
 def shift_seeds(jobs: Sequence[Job], shift: int) -> list[Job]:
-    """Return the same jobs with other simulated flights."""
+    """Return the same jobs with shifted seeds of the simulated flights."""
     return [
         replace(job, base=job.base and replace(job.base, seed=job.base.seed + shift))
         for job in jobs

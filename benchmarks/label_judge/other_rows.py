@@ -1,4 +1,4 @@
-"""Faults of heights, clocks and motion, and several at once."""
+"""Faults of heights, clocks and motion, and combinations of faults."""
 
 from collections.abc import Callable
 
@@ -39,7 +39,7 @@ def swap_robots(logs: Logs, size: float, rng: np.random.Generator) -> None:
 
 
 def shift_clock(of: Callable[[Array, Logs], Array]) -> Injector:
-    """Change the second robot's clock: all that it stamps, its truth as well."""
+    """Return an injector that shifts all times of the second robot's clock, also of its truth."""
 
     def inject(logs: Logs, size: float, rng: np.random.Generator) -> None:
         log, link = logs.robots[PEER], (PEER, OWN)

@@ -21,12 +21,12 @@ from label_judge.injection import (
 
 
 def drop_link(logs: Logs, size: float, rng: np.random.Generator) -> None:
-    """Leave out one direction of the ranges."""
+    """Remove the ranges that the second robot measured."""
     logs.ranges[PEER, OWN] = logs.ranges[PEER, OWN][:, :0]
 
 
 def thin_ranges(logs: Logs, size: float, rng: np.random.Generator) -> None:
-    """Lose most ranges, in bursts."""
+    """Remove a share of the ranges, in spans of half a second."""
     for link in BOTH:
         time_s = logs.ranges[link][0]
         kept = draw_spans(rng, time_s, 0.5) >= size
@@ -34,7 +34,7 @@ def thin_ranges(logs: Logs, size: float, rng: np.random.Generator) -> None:
 
 
 def silence_ranges(logs: Logs, size: float, rng: np.random.Generator) -> None:
-    """Silence the ranges for so many seconds."""
+    """Remove the ranges for so many seconds in the middle of the flight."""
     for link in BOTH:
         time_s = logs.ranges[link][0]
         logs.ranges[link] = logs.ranges[link][:, select_seconds(time_s, logs, size, 0.5) == 0]

@@ -1,4 +1,4 @@
-"""Real flights for the judge: pairs of NanoBench's, and the ranges of the TIERS group's robots."""
+"""Recordings of real flights: pairs of NanoBench flights, and ranges of the TIERS group."""
 
 from itertools import combinations
 from pathlib import Path
@@ -11,13 +11,13 @@ from dmrl.recording import Provenance, RecordingWriter
 from dmrl.samples.flight import START_NS
 
 OFFSET_M = 0.35
-"""Antenna delay of the TIERS group's ranges, metres."""
+"""Offset of the TIERS group's ranges from antenna delays, metres."""
 MOVING = ("turtle1", "turtle3", "turtle4")
 TRUTH_HZ, SEED = 20.0, 40
 
 
 def count_pairs(data: Path) -> int:
-    """Count the pairs of NanoBench's flights."""
+    """Return the number of pairs of NanoBench flights."""
     return len(list(combinations(sorted((data / "nanobench").glob("*.csv")), 2)))
 
 
@@ -36,17 +36,17 @@ def _convert_tiers(source: Path, path: Path) -> None:
 
 
 def _write_pair(number: int, folder: Path, path: Path) -> None:
-    """Write two real flights as one pair, with simulated ranges, as `bench_real_odometry` does."""
+    """Write two real flights as one pair with simulated ranges, like `bench_real_odometry`."""
     import bench_real_odometry as odometry  # noqa: PLC0415  # it imports the estimators
 
     files = sorted(folder.glob("*.csv"))
     first, second = list(combinations(files, 2))[number]
     rng = np.random.default_rng([SEED, number])
-    one, other = odometry.read(first), odometry.beside(odometry.read(second), rng)
+    one, other = odometry.read(first), odometry.move_aside(odometry.read(second), rng)
     end_s = min(one.time_s[-1], other.time_s[-1])
     if number % odometry.EVERY == odometry.EVERY - 1:
-        other = odometry.crashed(other, end_s - odometry.CRASH_S)
-    time_s, range_m = odometry.measured(one, other, rng)
+        other = odometry.add_crash(other, end_s - odometry.CRASH_S)
+    time_s, range_m = odometry.simulate_ranges(one, other, rng)
     forwards = rng.random(len(time_s)) < 0.5
     moments_s = np.arange(0.0, end_s, 1 / TRUTH_HZ)
     settings = {"pair": [first.name, second.name], "seed": SEED}
@@ -70,6 +70,6 @@ def _write_pair(number: int, folder: Path, path: Path) -> None:
             at_s, height = flown.log.height
             add(topics.HEIGHT(robot), "Height", at_s, height_m=np.ravel(height))
             add(topics.RANGE(robot, peer), "UwbRange", time_s[mine], range_m=range_m[mine])
-            x, y = odometry.truth(flown, away, moments_s).T
+            x, y = odometry.compute_truth(flown, away, moments_s).T
             exact = np.zeros((len(x), 9))
             add(topics.TRUTH(robot, peer), "PeerPosition", moments_s, x=x, y=y, covariance=exact)

@@ -1,6 +1,6 @@
-"""Faults that no error model of `dmrl label` describes: the goodness of fit must find them.
+"""Faults that no error model of `dmrl label` describes; the test of the fit has to find them.
 
-Signals, sizes and seeds were fixed on 27 November 2026, before the goodness of fit was written.
+Signals, sizes and seeds were fixed on 27 November 2026, before that test was written.
 """
 
 from dataclasses import replace
@@ -30,14 +30,14 @@ from label_judge.injection import (
 
 
 def swap_axes(logs: Logs, size: float, rng: np.random.Generator) -> None:
-    """Exchange vx and vy for a part of the flight."""
+    """Swap vx and vy during a share of the flight."""
     log = logs.robots[PEER]
     at = select_part(log["time_s"], logs, (0.5 - size / 2, 0.5 + size / 2)) > 0
     log[VX], log[VY] = np.where(at, log[VY], log[VX]), np.where(at, log[VX], log[VY])
 
 
 def splice_flight(logs: Logs, size: float, rng: np.random.Generator) -> None:
-    """Take so many seconds of a robot's log from another flight."""
+    """Replace so many seconds of a robot's log by those of another flight."""
     other = fly(Base("room", "calibrated", logs.end_s, 990))
     log, from_s = logs.robots[PEER], other.robots[PEER]["time_s"]
     at = select_seconds(log["time_s"], logs, size, 0.5) > 0
@@ -46,8 +46,8 @@ def splice_flight(logs: Logs, size: float, rng: np.random.Generator) -> None:
         log[name] = np.where(at, there, log[name])
 
 
-def exchange_late(logs: Logs, size: float, rng: np.random.Generator) -> None:
-    """Exchange the odometry of the robots at the end of the flight."""
+def swap_odometry(logs: Logs, size: float, rng: np.random.Generator) -> None:
+    """Swap the odometry of both robots during the last share of the flight."""
     logs_of = [logs.robots[robot] for robot in (OWN, PEER)]
     first = [log["time_s"] >= (1 - size) * logs.end_s for log in logs_of]
     for name in (VX, VY, YAW):
@@ -59,8 +59,8 @@ def exchange_late(logs: Logs, size: float, rng: np.random.Generator) -> None:
             log[name] = values
 
 
-def range_to_stranger(logs: Logs, size: float, rng: np.random.Generator) -> None:
-    """Measure the range to a robot that flies elsewhere for so many seconds."""
+def measure_stranger(logs: Logs, size: float, rng: np.random.Generator) -> None:
+    """Replace so many seconds of ranges, twice, by those of another flight."""
     other = fly(replace(Base("random", "calibrated", logs.end_s, 991)))
     for link in BOTH:
         time_s, range_m = logs.ranges[link]
@@ -70,7 +70,7 @@ def range_to_stranger(logs: Logs, size: float, rng: np.random.Generator) -> None
 
 
 def _smooth_ranges(range_m: Array, time_s: Array, size: float) -> Array:
-    """Return ranges that a driver averages over the last seconds."""
+    """Return ranges that a driver filters with a time constant of ``size`` seconds."""
     grid_s = np.arange(time_s[0], time_s[-1] + 0.01, 0.01)
     return np.interp(time_s, grid_s, filter_low(np.interp(grid_s, time_s, range_m), size))
 
@@ -84,9 +84,9 @@ UNLISTED_ROWS = (
     ),
     Row("vx and vy exchanged for a while", swap_axes, 0.3, FLOW, PEER),
     Row("yaw rate averaged", yaw(PEER, lambda v, t, g, s, r: filter_low(v, s)), 0.5, GYRO, PEER),
-    Row("ranges to a stranger", range_to_stranger, 10.0, RANGE),
+    Row("ranges to a stranger", measure_stranger, 10.0, RANGE),
     Row("log of another flight", splice_flight, 20.0, FLOW + "|" + GYRO, PEER),
-    Row("odometry exchanged at the end", exchange_late, 0.4, FLOW + "|" + GYRO),
+    Row("odometry exchanged at the end", swap_odometry, 0.4, FLOW + "|" + GYRO),
     Row(
         "ranges long and noisy in half of the room",
         ranges(
