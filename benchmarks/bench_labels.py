@@ -25,7 +25,7 @@ from dmrl.estimation.model.position_metrics import (
     compute_figures,
 )
 from dmrl.estimation.model.status import AMBIGUOUS, OK, probability_beyond
-from dmrl.estimation.signals.sensor_tracks import build_track as sensed
+from dmrl.estimation.signals.sensor_tracks import build_track
 from dmrl.estimation.solver.estimate import Estimate
 from dmrl.flight import NOISE, TRAJECTORIES, Flight, RobotLog, Scenario, simulate
 from dmrl.geometry.frames import Array
@@ -76,7 +76,7 @@ def resample(log: RobotLog, grid_s: Array) -> SensorTrack:
     """Resample the log of a robot on a common time grid."""
     velocity = np.stack([log.vx_mps, log.vy_mps], axis=1)
     yaw_rate, height = log.yaw_rate_radps[:, None], log.height_m[:, None]
-    return sensed(*((log.time_s, values) for values in (yaw_rate, velocity, height)), grid_s)
+    return build_track(*((log.time_s, values) for values in (yaw_rate, velocity, height)), grid_s)
 
 
 def evaluate(flight: Flight, robot: str, peer: str, estimate: Estimate) -> Flown:

@@ -9,12 +9,12 @@ from dmrl.geometry.frames import AIDECK, Array, Camera
 
 COLUMNS, ROWS, SQUARE_M = 7, 5, 0.03
 FINER = 3
-"""Rays along each side of a pixel: corners are as sharp as the blur says, not as a raster."""
+"""Rays along each side of a pixel, so that edges are not limited by the pixel raster."""
 
 
 @dataclass(frozen=True)
 class Look:
-    """How a picture comes out: blur and noise of the sensor, levels of the board."""
+    """Appearance of a rendered board: blur, pixel noise, and grey levels of its squares."""
 
     blur_px: float = 0.7
     noise: float = 0.0
@@ -22,8 +22,8 @@ class Look:
     white: float = 220.0
 
 
-def lens(rng: np.random.Generator) -> Camera:
-    """A camera of a drone, any focal length from wide to narrow."""
+def draw_lens(rng: np.random.Generator) -> Camera:
+    """Draw a small camera with a random focal length, centre and distortion."""
     width, height = ((320, 224), (324, 244))[rng.integers(2)]
     fx = width * rng.uniform(0.5, 1.1)
     middle = width / 2 + rng.uniform(-8, 8), height / 2 + rng.uniform(-20, 20)
@@ -31,21 +31,21 @@ def lens(rng: np.random.Generator) -> Camera:
     return Camera(width, height, fx, fx * rng.uniform(0.99, 1.01), *middle, tuple(bend))
 
 
-def pose(rng: np.random.Generator, camera: Camera = AIDECK) -> tuple[Array, Array]:
-    """Rotation vector and place of a board that is whole in view, optical frame."""
+def draw_pose(rng: np.random.Generator, camera: Camera = AIDECK) -> tuple[Array, Array]:
+    """Draw rotation vector and position of a board that is fully in view, optical frame."""
     while True:
         turn = rng.uniform((-0.7, -0.7, -0.4), (0.7, 0.7, 0.4))
         middle = np.array([(COLUMNS - 1) / 2, (ROWS - 1) / 2, 0.0]) * SQUARE_M
         far = rng.uniform(0.6, 1.3) * camera.fx_px / camera.width_px * COLUMNS * SQUARE_M / 0.6
         side = rng.uniform(-0.3, 0.3, 2) * far * np.array((camera.width_px, camera.height_px))
         place = np.array([*(side / camera.fx_px), far]) - cv2.Rodrigues(turn)[0] @ middle
-        uv = corners_of(turn, place, camera)
+        uv = project_corners(turn, place, camera)
         if ((uv > 6) & (uv < np.array([camera.width_px, camera.height_px]) - 6)).all():
             return turn, place
 
 
-def corners_of(turn: Array, place: Array, camera: Camera = AIDECK) -> Array:
-    """(columns x rows, 2) true corners, pixel-edge coordinates."""
+def project_corners(turn: Array, place: Array, camera: Camera = AIDECK) -> Array:
+    """Return (columns x rows, 2) true corners of a board, pixel-edge coordinates."""
     flat = np.zeros((COLUMNS * ROWS, 3))
     flat[:, :2] = np.mgrid[:COLUMNS, :ROWS].T.reshape(-1, 2) * SQUARE_M
     bend = np.array(camera.distortion or (0.0,) * 5)
@@ -53,14 +53,14 @@ def corners_of(turn: Array, place: Array, camera: Camera = AIDECK) -> Array:
     return np.asarray(uv, np.float64).reshape(-1, 2)
 
 
-def picture(
+def render_board(
     turn: Array,
     place: Array,
     camera: Camera = AIDECK,
     look: Look | None = None,
     rng: np.random.Generator | None = None,
 ) -> np.ndarray:
-    """The board as the camera shows it: rays through every pixel meet the board's plane."""
+    """Render the board by intersecting the rays of every pixel with its plane."""
     look = look or Look()
     height, width = camera.height_px, camera.width_px
     v, u = (np.mgrid[: height * FINER, : width * FINER] + 0.5) / FINER

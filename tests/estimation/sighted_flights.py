@@ -1,4 +1,4 @@
-"""Detections in the flights of `flights`: exact, noisy, or false."""
+"""Simulated camera bearings for the flights of `flights`."""
 
 import numpy as np
 
@@ -9,10 +9,10 @@ from dmrl.flight import Flight
 STD: Array = np.array([0.02, 0.03, 0.1])
 NOISE: Array = np.array([0.01, 0.01, 0.1])
 WIDE_RAD = 0.7
-"""Half a camera's field of view."""
+"""Half the horizontal field of view of the camera."""
 
 
-def sightings(
+def simulate_bearings(
     flight: Flight,
     own: str,
     peers: tuple[str, ...],
@@ -22,22 +22,22 @@ def sightings(
     wrong: float = 0.07,
     seed: int = 0,
 ) -> BearingMeasurements:
-    """What a robot's camera shows of its peers; images that show nothing are left out.
+    """Return noisy and false detections of a robot's camera; images without any are left out.
 
     Parameters
     ----------
     flight
         A simulated flight.
     own, peers
-        The robot, and who may be seen.
+        The robot, and the peers that it may detect.
     hz
-        Images a second.
+        Images per second.
     missed
-        Share of what is in view that is not found.
+        Share of peers in view that are not detected.
     wrong
-        Share of images with a candidate that is nothing.
+        Share of images with a false detection.
     seed
-        Of the detector.
+        Seed of the detector's errors.
     """
     rng = np.random.default_rng(seed)
     time_s = np.arange(flight.robots[own].time_s[0] + 0.03, flight.robots[own].time_s[-1], 1 / hz)
@@ -56,13 +56,13 @@ def sightings(
     )
 
 
-def rmse(xy: Array, truth: Array) -> float:
-    """Root mean square distance, metres."""
+def compute_rmse(xy: Array, truth: Array) -> float:
+    """Return the root mean square distance, metres."""
     return float(np.sqrt(((xy - truth) ** 2).sum(axis=1).mean()))
 
 
-def still_pair(bearing_rad: float = 0.0) -> tuple[Pair, Array]:
-    """Two robots that do nothing for 10 s, the peer 2 m away and as high; where it is (2,)."""
+def build_still_pair(bearing_rad: float = 0.0) -> tuple[Pair, Array]:
+    """Return a pair at rest for 10 s, the peer 2 m away at equal height, and its position (2,)."""
     time_s = np.arange(0, 10.005, 0.01)
     zero, never = np.zeros(len(time_s)), np.zeros(len(time_s), bool)
     still = SensorTrack(zero, zero, zero, zero, never)

@@ -274,7 +274,7 @@ def draw_boards(folder: Path) -> None:
     rng = np.random.default_rng(0)
     folder.mkdir()
     for k in range(7):
-        grey = boards.picture(*boards.pose(rng))
+        grey = boards.render_board(*boards.draw_pose(rng))
         (folder / f"{k}.png").write_bytes(encode_png(np.repeat(grey[..., None], 3, axis=2)))
 
 

@@ -15,7 +15,7 @@ from dmrl.labelling.camera_bearings import (
 )
 from dmrl.labelling.observer_log import ObserverLog
 
-from ..estimation.sighted_flights import still_pair
+from ..estimation.sighted_flights import build_still_pair
 
 CAMERA = Camera(320, 224, 180.0, 180.0, 160.0, 112.0)
 COUNT, STEP_NS, START_NS = 40, 100_000_000, 7_000_000_000
@@ -69,7 +69,7 @@ def test_images_have_as_many_candidates_as_they_show() -> None:
 
 
 def test_both_robots_of_a_pair_get_their_bearings() -> None:
-    pair, _ = still_pair()
+    pair, _ = build_still_pair()
     sees = detections_to_bearings(seen(), START_NS, 3.0, 0.01)
     pairs = add_bearings({("a", "b"): pair, ("b", "c"): pair}, {"b": sees})
     assert pairs["a", "b"].peer_bearings is sees and pairs["a", "b"].own_bearings is None

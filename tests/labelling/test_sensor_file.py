@@ -11,7 +11,7 @@ from dmrl.labelling.flight_log import read_flight
 from dmrl.labelling.sensor_file import SensorConstants, read_sensors, write_sensors
 from dmrl.labelling.sensor_logs import build_sensor_logs
 
-from ..estimation.flights import flown, pair_of
+from ..estimation.flights import build_pair, simulate_flight
 from .test_sensor_logs import flight, logs, ranges
 
 KNOWN = SensorConstants(
@@ -107,7 +107,7 @@ def test_known_sensor_errors_are_removed_on_reading(tmp_path: Path) -> None:
 
 @pytest.mark.heavy
 def test_known_constants_stay_fixed_in_the_solve() -> None:
-    pair = pair_of(flown("in_view", "realistic", 31))
+    pair = build_pair(simulate_flight("in_view", "realistic", 31))
     free = estimate_pairs([pair])[0][0]
     known: dict[Subject, float] = {("range_offset", (0, 1)): 1e-4, ("velocity_scale", (1,)): 1e-4}
     held = estimate_pairs([replace(pair, known_std=known)])[0][0]

@@ -21,7 +21,7 @@ from dmrl.samples.flight import START_NS
 from dmrl.stages import calibrate, fly, label
 from dmrl.stages.calibrate import Settings
 
-from ..estimation.boards import picture, pose
+from ..estimation.boards import draw_pose, render_board
 from .detector import with_detections
 
 pytestmark = pytest.mark.heavy
@@ -53,7 +53,7 @@ def boards(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("boards")
     rng = np.random.default_rng(0)
     for k in range(9):
-        grey = picture(*pose(rng))
+        grey = render_board(*draw_pose(rng))
         (folder / f"{k}.png").write_bytes(encode_png(np.repeat(grey[..., None], 3, axis=2)))
     return folder
 

@@ -1,4 +1,4 @@
-"""Joint solve of mount and path errors, against dense equations and shifted paths."""
+"""Joint solve of mount and path errors, compared with dense equations and shifted paths."""
 
 from dataclasses import replace
 
@@ -44,18 +44,18 @@ from dmrl.estimation.calibration.observations import (
 )
 from dmrl.geometry.frames import AIDECK, Array
 
-from .test_extrinsics import TRUE, flight
+from .test_extrinsics import TRUE, simulate_calibration_flight
 
 VALUES = np.array([*TRUE.mount_rad, TRUE.delay_s])
 NOISE = Noise(3.0, 0.02)
 
 
-def seen(images: int = 30) -> tuple[list[PeerView], Matches]:
-    """Two flights of a peer each, and a third whose peer nobody saw."""
+def build_views(images: int = 30) -> tuple[list[PeerView], Matches]:
+    """Return three flights of a peer, of which the second has no detections, and the matches."""
     spread = np.array([[0.04, 0.01, 0.0], [0.01, 0.09, 0.002], [0.0, 0.002, 0.01]])
     views: list[PeerView] = []
     for seed in range(3):
-        one = flight(seed, images=images, outliers=0.0)
+        one = simulate_calibration_flight(seed, images=images, outliers=0.0)
         path = one.peers["cf2"]
         wide = np.broadcast_to((1 + 0.2 * seed) * spread, path.covariance.shape)
         views.append((one, replace(path, covariance=wide)))
@@ -63,7 +63,7 @@ def seen(images: int = 30) -> tuple[list[PeerView], Matches]:
     return views, match_detections(views, TRUE, 40.0, NOISE)
 
 
-VIEWS, MATCHED = seen()
+VIEWS, MATCHED = build_views()
 
 
 def test_pixel_jacobian_equals_finite_differences() -> None:
@@ -74,7 +74,7 @@ def test_pixel_jacobian_equals_finite_differences() -> None:
         ahead, behind = (
             pixel_residuals(VIEWS, AIDECK, MATCHED, VALUES + s * step) for s in (1, -1)
         )
-        slope = (behind - ahead) / 2e-5  # of what is expected: left is what was seen, less that
+        slope = (behind - ahead) / 2e-5  # a residual is the detection minus the prediction
         assert found[:, :, k] == pytest.approx(slope, rel=0.02, abs=0.02 * np.abs(slope).max())
 
 
@@ -89,7 +89,7 @@ def test_error_axes_are_along_and_across_the_line_of_sight_and_up() -> None:
         for column, way in enumerate(ways[k]):
             std = (way @ spread[k] @ way) ** 0.5
             assert axes[k, :, column] == pytest.approx(std * way, abs=1e-6)
-    level = np.array([5.0, 2.0, 0.1])  # who is straight above is at no bearing
+    level = np.array([5.0, 2.0, 0.1])  # a peer straight above has no bearing
     sideways = np.array([[-0.8, 0.6, 0], [0, -1, 0], [-0.4, 0.3, 0]])
     across = np.sqrt(np.einsum("ni,nij,nj->n", sideways, spread, sideways))
     assert axes[:, :, 1] == pytest.approx(across[:, None] * sideways, abs=1e-6)
@@ -104,7 +104,7 @@ def test_knots_have_an_exponential_markov_prior() -> None:
 
 def test_path_error_jacobian_equals_finite_differences() -> None:
     paths = _linearize_paths(VIEWS, TRUE, MATCHED, VALUES)
-    assert [path.flight for path in paths] == [0, 1]  # of those that were seen
+    assert [path.flight for path in paths] == [0, 1]  # the flight without detections is left out
     for path, number in zip(paths, (0, 2), strict=True):
         one, peer = VIEWS[number]
         assert (MATCHED.view[path.rows] == number).all()
@@ -119,7 +119,7 @@ def test_path_error_jacobian_equals_finite_differences() -> None:
             shift = (predict_pixels(one, camera, moved, time_s)[0] - before).ravel() / size
             shown = path.errors[:, [column]].toarray().ravel()
             assert shown == pytest.approx(shift, abs=0.06 * np.abs(shift).max())
-        # All knots together are one shift across the line of sight.
+        # The sum over all knots is a constant shift across the line of sight.
         moved = replace(peer, xyz_m=peer.xyz_m + size * np.sqrt(DECAYING_SHARE) * axes[:, :, 1])
         shift = (predict_pixels(one, camera, moved, time_s)[0] - before).ravel() / size
         every = path.errors[:, 4:].sum(axis=1)

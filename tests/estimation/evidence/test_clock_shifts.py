@@ -1,4 +1,4 @@
-"""Shifts of a clock that the ranges of both robots, or the motion, show: offsets and jumps."""
+"""Offsets and jumps of a clock, found from two-way ranges or from the motion."""
 
 from dataclasses import replace
 
@@ -21,11 +21,11 @@ from dmrl.estimation.solver.keyframes import build_problem
 from dmrl.estimation.solver.problem import NoiseModel
 from dmrl.estimation.solver.robust_loss import Gaussian
 
-from ..flights import both_ranging, flown, pair_of, truth_at
+from ..flights import build_pair, build_two_way_pair, compute_truth, simulate_flight
 
 
 def test_a_clock_moves_with_all_that_it_stamps() -> None:
-    pair = both_ranging(flown("in_view", "calibrated", 1000, 20.0))
+    pair = build_two_way_pair(simulate_flight("in_view", "calibrated", 1000, 20.0))
     moved = ClockShift(2.0).move(pair)
     at = slice(300, 1500)
     assert moved.peer.vx_mps[500:1700] == pytest.approx(pair.peer.vx_mps[at])
@@ -40,7 +40,7 @@ def test_a_clock_moves_with_all_that_it_stamps() -> None:
 
 
 def test_a_jump_moves_what_comes_after_it() -> None:
-    pair = both_ranging(flown("in_view", "calibrated", 1000, 20.0))
+    pair = build_two_way_pair(simulate_flight("in_view", "calibrated", 1000, 20.0))
     moved = ClockShift(-0.4, 10.0).move(pair)
     assert moved.peer.vx_mps[:950] == pytest.approx(pair.peer.vx_mps[:950])
     assert moved.peer.vx_mps[970:1900] == pytest.approx(pair.peer.vx_mps[1010:1940])
@@ -59,17 +59,18 @@ def test_times_return_to_the_log(shift: ClockShift) -> None:
 
 
 @pytest.mark.heavy
-def test_the_ranges_of_both_robots_hold_the_clock_of_the_solve() -> None:
-    flight = flown("in_view", "calibrated", 1000, 60.0)
+def test_two_way_ranges_constrain_the_clock_of_the_solve() -> None:
+    flight = simulate_flight("in_view", "calibrated", 1000, 60.0)
     known, off = (
-        with_known_clock(ClockShift(shift_s).move(both_ranging(flight))) for shift_s in (0.0, 0.045)
+        with_known_clock(ClockShift(shift_s).move(build_two_way_pair(flight)))
+        for shift_s in (0.0, 0.045)
     )
     assert known.known_std["clock", (1,)] < 0.02 < off.known_std["clock", (1,)]
     problem = build_problem({(0, 1): known})
     (row,) = (row for (name, _), row in problem.layout.constants if name == "clock")
     assert isinstance(row.loss, Gaussian)
     assert "clock offset" not in {one.model.name for one in list_shown(problem)}
-    one_way = pair_of(flight)
+    one_way = build_pair(flight)
     assert with_known_clock(one_way) is one_way
     alone = list_shown(build_problem({(0, 1): one_way}))
     assert "clock offset" in {one.model.name for one in alone}
@@ -78,7 +79,7 @@ def test_the_ranges_of_both_robots_hold_the_clock_of_the_solve() -> None:
 @pytest.mark.parametrize("shift_s", [0.07, 0.12, -0.3, 3.2])
 @pytest.mark.heavy
 def test_the_ranges_of_both_robots_show_an_offset_of_the_clock(shift_s: float) -> None:
-    sound = both_ranging(flown("in_view", "calibrated", 1000, 60.0))
+    sound = build_two_way_pair(simulate_flight("in_view", "calibrated", 1000, 60.0))
     late = ClockShift(shift_s).move(sound)
     found = find_clock_shift(late)
     assert found is not None
@@ -93,7 +94,9 @@ def test_the_ranges_of_both_robots_show_an_offset_of_the_clock(shift_s: float) -
 
 @pytest.mark.heavy
 def test_a_clock_that_is_seconds_off_fits_when_it_is_moved() -> None:
-    late = ClockShift(3.2).move(both_ranging(flown("in_view", "calibrated", 1000, 60.0)))
+    late = ClockShift(3.2).move(
+        build_two_way_pair(simulate_flight("in_view", "calibrated", 1000, 60.0))
+    )
     found = find_clock_shift(late)
     assert found is not None
     assert compute_misfit(found.move(late)) < 0.6
@@ -102,21 +105,21 @@ def test_a_clock_that_is_seconds_off_fits_when_it_is_moved() -> None:
 @pytest.mark.heavy
 @pytest.mark.parametrize("shift_s", [-0.4, 0.5])
 def test_a_flight_whose_clock_jumps_is_solved_as_if_it_did_not(shift_s: float) -> None:
-    flight = flown("in_view", "realistic", 1000, 100.0)
-    sound = pair_of(flight)
-    jumping = ClockShift(shift_s, 40.0).move(both_ranging(flight))
+    flight = simulate_flight("in_view", "realistic", 1000, 100.0)
+    sound = build_pair(flight)
+    jumping = ClockShift(shift_s, 40.0).move(build_two_way_pair(flight))
     ((own, peer),) = estimate_pairs([jumping])
     cause = own.causes[0]
     assert cause.name.startswith(f"clock fits if it is moved by {-shift_s:+.1f}"[:-1])
     assert cause.from_s == pytest.approx(40.0, abs=2.0) and cause.to_s == sound.time_s[-1]
     assert cause.probability == 1.0 and peer.causes[0].name == cause.name
-    error = np.hypot(*(own.state[:, :2] - truth_at(flight, own.time_s)).T)
+    error = np.hypot(*(own.state[:, :2] - compute_truth(flight, own.time_s)).T)
     assert np.sqrt((error**2).mean()) < 0.2
     assert (np.diff(peer.time_s) >= 0).all()
     assert own.time_s[-1] == pytest.approx(sound.time_s[-1], abs=0.1)
 
 
-def ranged_by(pair: Pair, robot: int) -> Pair:
+def keep_ranges_of(pair: Pair, robot: int) -> Pair:
     """Return a pair without the ranges of the other robot."""
     kept = pair.range_sender == robot
     assert pair.range_sender is not None
@@ -129,9 +132,9 @@ def ranged_by(pair: Pair, robot: int) -> Pair:
 @pytest.mark.heavy
 @pytest.mark.parametrize(("shift_s", "robot"), [(0.15, 0), (0.6, 0), (-0.3, 1), (0.0, 0)])
 def test_motion_shows_the_clock_of_a_robot_that_does_not_range(shift_s: float, robot: int) -> None:
-    flight = flown("in_view", "calibrated", 1000, 60.0)
+    flight = simulate_flight("in_view", "calibrated", 1000, 60.0)
     shift = ClockShift(shift_s)
-    ((own, peer),) = estimate_pairs([ranged_by(shift.move(both_ranging(flight)), robot)])
+    ((own, peer),) = estimate_pairs([keep_ranges_of(shift.move(build_two_way_pair(flight)), robot)])
     named = [cause.name for cause in own.causes if cause.name.startswith("clock fits")]
     assert len(named) == (shift_s != 0.0)
     for one, (observer, seen), offset_s in (
@@ -139,7 +142,7 @@ def test_motion_shows_the_clock_of_a_robot_that_does_not_range(shift_s: float, r
         (peer, ("cf2", "cf1"), shift_s),
     ):
         kept = (one.status == OK) & (one.time_s > 20.0)
-        truth = truth_at(flight, one.time_s[kept] - offset_s, observer, seen)
+        truth = compute_truth(flight, one.time_s[kept] - offset_s, observer, seen)
         error = np.hypot(*(one.state[kept, :2] - truth).T)
         assert kept.mean() > 0.5 and np.sqrt((error**2).mean()) < 0.2
 
@@ -161,6 +164,8 @@ def test_an_uncertain_clock_widens_positions_along_the_motion() -> None:
 @pytest.mark.heavy
 @pytest.mark.parametrize("robot", [0, 1])
 def test_calibration_pools_constants_whichever_robot_ranges(robot: int) -> None:
-    pair = ranged_by(both_ranging(flown("in_view", "calibrated", 1000, 20.0)), robot)
+    pair = keep_ranges_of(
+        build_two_way_pair(simulate_flight("in_view", "calibrated", 1000, 20.0)), robot
+    )
     ((own, _),) = estimate_pairs([pair], plain=True)
     assert own.constants_covariance is not None

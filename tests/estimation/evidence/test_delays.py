@@ -1,4 +1,4 @@
-"""Late signals: which are moved, by how much, and what the flight is then."""
+"""Delayed signals are found, moved back and named."""
 
 from dataclasses import replace
 
@@ -10,7 +10,7 @@ from dmrl.estimation.evidence.error_models import Candidate, list_candidates
 from dmrl.estimation.flight.pairs import estimate_pairs
 from dmrl.estimation.model.pair import Pair
 
-from ..flights import both_ranging, flown, pair_of, truth_at
+from ..flights import build_pair, build_two_way_pair, compute_truth, simulate_flight
 
 MODELS = {
     row.name: one
@@ -19,10 +19,11 @@ MODELS = {
     for row in one.model.rows
     if row.name in SIGNALS
 }
-"""Models of a delay, of the second robot or of the pair, by their unknown."""
+"""Error models of a delay of the second robot or of the pair, by name of their unknown."""
 
 
-def late_flow(pair: Pair, delay_s: float) -> Pair:
+def delay_flow(pair: Pair, delay_s: float) -> Pair:
+    """Return a pair whose second robot logs its velocities late."""
     return move_signal(pair, Delay("flow_delay", MODELS["flow_delay"], -delay_s))
 
 
@@ -31,7 +32,7 @@ def test_every_signal_has_its_error_model() -> None:
 
 
 def test_gaps_of_a_late_yaw_rate_move_with_it() -> None:
-    pair = pair_of(flown("in_view", "calibrated", 1000, 20.0))
+    pair = build_pair(simulate_flight("in_view", "calibrated", 1000, 20.0))
     gap = np.arange(len(pair.time_s)) // 100 == 5
     peer = replace(pair.peer, dropout=gap, turn_dropout=gap)
     delay = Delay("yaw_rate_delay", MODELS["yaw_rate_delay"], 0.3)
@@ -42,7 +43,7 @@ def test_gaps_of_a_late_yaw_rate_move_with_it() -> None:
 
 @pytest.mark.parametrize("unknown", list(SIGNALS))
 def test_one_signal_is_moved_and_no_other(unknown: str) -> None:
-    pair = pair_of(flown("in_view", "calibrated", 1000, 20.0))
+    pair = build_pair(simulate_flight("in_view", "calibrated", 1000, 20.0))
     moved = move_signal(pair, Delay(unknown, MODELS[unknown], 0.3))
     assert moved.own is pair.own
     for name in ("vx_mps", "vy_mps", "yaw_rate_radps", "height_m"):
@@ -70,12 +71,12 @@ def test_most_windows_must_show_a_delay() -> None:
 
 @pytest.mark.heavy
 def test_long_delays_are_moved_and_named_once() -> None:
-    flight = flown("in_view", "calibrated", 1003, 60.0)
-    late = late_flow(pair_of(flight), 0.3)
+    flight = simulate_flight("in_view", "calibrated", 1003, 60.0)
+    late = delay_flow(build_pair(flight), 0.3)
     ((plain, _),) = estimate_pairs([late], plain=True)
     ((found, other),) = estimate_pairs([late])
     rmse_m = [
-        np.sqrt(np.square(one.state[:, :2] - truth_at(flight, one.time_s)).sum(axis=1).mean())
+        np.sqrt(np.square(one.state[:, :2] - compute_truth(flight, one.time_s)).sum(axis=1).mean())
         for one in (plain, found)
     ]
     assert rmse_m[1] < 0.6 * rmse_m[0]
@@ -85,12 +86,12 @@ def test_long_delays_are_moved_and_named_once() -> None:
 
 @pytest.mark.heavy
 def test_late_ranges_of_both_robots_are_no_offset_of_a_clock() -> None:
-    flight = flown("in_view", "calibrated", 1003, 60.0)
-    sound = both_ranging(flight)
+    flight = simulate_flight("in_view", "calibrated", 1003, 60.0)
+    sound = build_two_way_pair(flight)
     late = move_signal(sound, Delay("range_delay", MODELS["range_delay"], -0.3))
     ((plain, _),), ((found, _),) = estimate_pairs([sound]), estimate_pairs([late])
     rmse_m = [
-        np.sqrt(np.square(one.state[:, :2] - truth_at(flight, one.time_s)).sum(axis=1).mean())
+        np.sqrt(np.square(one.state[:, :2] - compute_truth(flight, one.time_s)).sum(axis=1).mean())
         for one in (plain, found)
     ]
     assert rmse_m[1] < 1.2 * rmse_m[0]
@@ -98,7 +99,7 @@ def test_late_ranges_of_both_robots_are_no_offset_of_a_clock() -> None:
 
 
 @pytest.mark.heavy
-def test_a_sound_flight_is_solved_once() -> None:
-    pair = pair_of(flown("in_view", "calibrated", 1003, 20.0))
+def test_a_sound_flight_shows_no_delay() -> None:
+    pair = build_pair(simulate_flight("in_view", "calibrated", 1003, 20.0))
     ((found, _),) = estimate_pairs([replace(pair)])
     assert not [cause for cause in found.causes if "late" in cause.name]

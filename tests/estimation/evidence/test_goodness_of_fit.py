@@ -28,13 +28,13 @@ from dmrl.estimation.solver.residuals import Rows, Values
 from dmrl.estimation.solver.robust_loss import Gaussian
 from dmrl.estimation.solver.unknowns import Unknown, with_rows
 
-from ..flights import flown, pair_of
+from ..flights import build_pair, simulate_flight
 
 LENGTH_S = 30.0
 
 
-def pair() -> Pair:
-    return pair_of(flown("in_view", "calibrated", 1003, LENGTH_S))
+def simulate_pair() -> Pair:
+    return build_pair(simulate_flight("in_view", "calibrated", 1003, LENGTH_S))
 
 
 def solve(given: Pair) -> tuple[Solver, Values]:
@@ -44,7 +44,7 @@ def solve(given: Pair) -> tuple[Solver, Values]:
 
 @cache
 def solve_sound() -> tuple[Solver, Values]:
-    return solve(pair())
+    return solve(simulate_pair())
 
 
 @pytest.mark.heavy
@@ -60,7 +60,7 @@ def test_a_sound_flight_fits() -> None:
 
 @pytest.mark.heavy
 def test_a_stretch_of_swapped_axes_does_not_fit() -> None:
-    sound = pair()
+    sound = simulate_pair()
     at = (sound.time_s > 10) & (sound.time_s < 20)
     y = np.where(at, sound.own.vx_mps, sound.own.vy_mps)
     x = np.where(at, sound.own.vy_mps, sound.own.vx_mps)
@@ -72,7 +72,8 @@ def test_a_stretch_of_swapped_axes_does_not_fit() -> None:
 
 @pytest.mark.heavy
 def test_a_statistic_is_the_fall_of_the_cost_if_the_error_were_estimated() -> None:
-    problem = build_problem({(0, 1): pair()})
+    """The score test agrees with a solve that has the error as a further unknown."""
+    problem = build_problem({(0, 1): simulate_pair()})
     square = Gaussian()
     noise = NoiseModel(range_loss=square, motion_loss=square)
     rows = [replace(row, loss=square, pull_weight=0.0) for row in problem.table]
@@ -108,8 +109,8 @@ def test_scores_are_those_of_the_optimum_where_a_solve_ended_before_it() -> None
 
 
 @pytest.mark.heavy
-def test_the_covariance_lacks_what_all_unknowns_explain() -> None:
-    """The unknowns of the keyframes and the constants: by the inverse of the whole matrix."""
+def test_score_covariance_excludes_what_the_unknowns_explain() -> None:
+    """It equals the Schur complement of the dense matrix of keyframes and constants."""
     solver, values = solve_sound()
     equations, factors = solver.equations(values)
     found = compute_scores(solver, values)[0]
@@ -190,7 +191,7 @@ def test_consistent_images_end_the_error_of_another_sensor(signal: str, refused:
     cause = Cause(f"{signal} does not fit", 1.0, 40.0, 50.0)
     none = np.zeros(100, np.int8)
     given = Estimate(time_s, state, spread, none, np.zeros(0), NoiseModel(), causes=(cause,))
-    # Images inside the stretch, or none at all, end nothing.
+    # Only images before and after the stretch shorten it; one inside does not.
     for placed, expected in (
         (np.isin(time_s, [5, 38, 45, 52, 90]), refused),
         (np.isin(time_s, [45]), range(10, 81)),

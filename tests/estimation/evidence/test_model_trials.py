@@ -23,13 +23,13 @@ from dmrl.estimation.solver.keyframes import build_problem
 from dmrl.estimation.solver.levenberg_marquardt import Solver
 from dmrl.estimation.solver.residuals import Rows, Values
 
-from ..flights import flown, pair_of
+from ..flights import build_pair, simulate_flight
 
 FOR_A_WHILE = next(model for model in MODELS if model.for_a_while)
 
 
 def solve_plain(pair: Pair) -> Member:
-    """The plain solution of a flight."""
+    """Solve a flight without error models."""
     solution = solve_pair(build_problem({(0, 1): pair}), plain=True)
     found = solve_under(solution.solver, solution.values, ())
     assert found is not None
@@ -38,11 +38,11 @@ def solve_plain(pair: Pair) -> Member:
 
 @cache
 def solve_sound() -> Member:
-    return solve_plain(pair_of(flown("in_view", "calibrated", 1000, 20.0)))
+    return solve_plain(build_pair(simulate_flight("in_view", "calibrated", 1000, 20.0)))
 
 
 def add_flow_noise(pair: Pair, where: Array, seed: int = 5) -> Pair:
-    """The pair with noise of 0.5 m/s over 0.3 s in the first robot's flow."""
+    """Add velocity noise of 0.5 m/s with a time constant of 0.3 s to the first robot's flow."""
     rng = np.random.default_rng(seed)
     steps = rng.normal(0.0, 1.0, (2, len(pair.time_s)))
     kept = np.exp(-0.01 / 0.3)
@@ -97,7 +97,7 @@ def test_models_without_gain_are_not_solved_after_a_leading_one(
 
 @pytest.mark.heavy
 def test_quiet_flight_has_no_noisy_stretch() -> None:
-    base = solve_plain(pair_of(flown("in_view", "calibrated", 1000, 40.0)))
+    base = solve_plain(build_pair(simulate_flight("in_view", "calibrated", 1000, 40.0)))
     assert [find_noisy_steps(base.solver, base.values, robot) for robot in (0, 1)] == [None, None]
     assert find_noisy_steps(base.solver, base.values, 0, -1.0) is not None
 
@@ -115,7 +115,7 @@ def test_levels_are_decoded_to_the_ends_of_the_flight() -> None:
 
 @pytest.mark.heavy
 def test_noise_for_a_while_is_found_and_widens_its_stretch_alone() -> None:
-    pair = pair_of(flown("room", "calibrated", 1003, 60.0))
+    pair = build_pair(simulate_flight("room", "calibrated", 1003, 60.0))
     where = (pair.time_s > 20) & (pair.time_s < 35)
     base = solve_plain(add_flow_noise(pair, where))
     found = [try_model(base, Candidate(FOR_A_WHILE, robot)) for robot in (0, 1)]
@@ -132,7 +132,9 @@ def test_noise_for_a_while_is_found_and_widens_its_stretch_alone() -> None:
 
 
 def test_velocity_errors_count_coloured_noise_of_their_robot_alone() -> None:
-    problem = build_problem({(0, 1): pair_of(flown("in_view", "calibrated", 1000, 20.0))})
+    problem = build_problem(
+        {(0, 1): build_pair(simulate_flight("in_view", "calibrated", 1000, 20.0))}
+    )
     solver, layout = Solver(problem), problem.layout
     state = np.zeros((len(problem.keyframe_s), layout.width))
     state[50, layout.state_column("velocity_error_x", 0)] = 0.5

@@ -13,17 +13,20 @@ from dmrl.estimation.filters.ekf import (
 )
 from dmrl.estimation.model.pair import Pair, SensorTrack
 
-from ..flights import flown, pair_of
+from ..flights import build_pair, simulate_flight
 
 
-def steps_of(seed: int, preset: str) -> Steps:
-    return build_steps(pair_of(flown("in_view", "realistic", seed, 8.0)), PRESETS[preset])
+def build_ekf_steps(seed: int, preset: str) -> Steps:
+    """Return the filter steps of a simulated flight of 8 s."""
+    return build_steps(
+        build_pair(simulate_flight("in_view", "realistic", seed, 8.0)), PRESETS[preset]
+    )
 
 
 def test_filterpy_needs_a_one_dimensional_state() -> None:
     ekf = ExtendedKalmanFilter(dim_x=3, dim_z=1)
-    assert ekf.x.shape == (3, 1)  # the default, with which a flat gain broadcasts to (3, 3)
-    state, _ = filter_pair(steps_of(1000, "published-sim"), PRESETS["published-sim"])
+    assert ekf.x.shape == (3, 1)  # this default and a flat gain would broadcast to (3, 3)
+    state, _ = filter_pair(build_ekf_steps(1000, "published-sim"), PRESETS["published-sim"])
     assert state.shape[1:] == (3,)
 
 
@@ -41,7 +44,7 @@ def test_a_range_is_an_update_after_the_prediction() -> None:
 
 
 def test_the_published_filter_starts_at_zero_and_first_predicts() -> None:
-    steps = steps_of(1000, "published-sim")
+    steps = build_ekf_steps(1000, "published-sim")
     silent = Steps(steps.inputs, steps.height_m, steps.range_m * np.nan, steps.dt_s)
     state, _ = filter_pair(silent, PRESETS["published-sim"])
     expected, _, _ = propagate_state(np.zeros(3), steps.inputs[0], steps.dt_s)
@@ -66,8 +69,8 @@ def test_ekf_jacobians_equal_finite_differences() -> None:
 
 
 def test_the_simulation_preset_ignores_heights() -> None:
-    assert not steps_of(1000, "published-sim").height_m.any()
-    assert steps_of(1000, "published-firmware").height_m.any()
+    assert not build_ekf_steps(1000, "published-sim").height_m.any()
+    assert build_ekf_steps(1000, "published-firmware").height_m.any()
 
 
 def test_predicted_range_is_three_dimensional() -> None:
@@ -90,7 +93,7 @@ def test_ekf_steps_hold_inputs_and_ranges_go_to_the_nearest_step() -> None:
     columns = [peer.vx_mps, peer.vy_mps, peer.yaw_rate_radps]
     columns += [own.vx_mps, own.vy_mps, own.yaw_rate_radps]
     assert steps.inputs == pytest.approx(np.column_stack(columns))
-    heard = {0: 1.0, 1: 3.0, 49: 4.0}  # of two of one step the last
+    heard = {0: 1.0, 1: 3.0, 49: 4.0}  # a step keeps the last of its ranges
     for k, range_m in enumerate(steps.range_m):
         assert range_m == heard[k] if k in heard else np.isnan(range_m)
 

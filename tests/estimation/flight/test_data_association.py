@@ -17,14 +17,15 @@ from dmrl.estimation.model.status import OK
 from dmrl.estimation.solver.estimate import PAIR_LAYOUT, Estimate, seen_from_peer
 from dmrl.estimation.solver.problem import NoiseModel
 
-from ..sighted_flights import STD, still_pair
+from ..sighted_flights import STD, build_still_pair
 
 TIMES_S = np.arange(0.5, 9.5, 0.5)
 LEFT, RIGHT = 0.5, -0.5
 Names = tuple[str, str]
 
 
-def candidates(*bearings_rad: float) -> BearingMeasurements:
+def build_candidates(*bearings_rad: float) -> BearingMeasurements:
+    """Return images that all show candidates at these bearings, two metres away."""
     polar = [[bearing, 0.0, np.log(2.0)] for bearing in bearings_rad]
     shape = len(TIMES_S), 1, 1
     return BearingMeasurements(
@@ -32,9 +33,9 @@ def candidates(*bearings_rad: float) -> BearingMeasurements:
     )
 
 
-def at(bearing_rad: float, sigma_m: float = 0.1) -> Estimate:
-    """A peer that stands two metres away."""
-    pair, where = still_pair(bearing_rad)
+def build_estimate(bearing_rad: float, sigma_m: float = 0.1) -> Estimate:
+    """Return an estimate of a peer at rest, two metres away at this bearing."""
+    pair, where = build_still_pair(bearing_rad)
     state = np.zeros((101, 3))
     state[:, :2] = where
     covariance = np.tile(sigma_m**2 * np.eye(3), (101, 1, 1))
@@ -44,61 +45,72 @@ def at(bearing_rad: float, sigma_m: float = 0.1) -> Estimate:
     return Estimate(time_s, state, covariance, status, constants, NoiseModel())
 
 
-def both_ways(found: dict[Names, Estimate]) -> dict[Names, Estimate]:
+def add_reversed(found: dict[Names, Estimate]) -> dict[Names, Estimate]:
+    """Add the estimates seen from the peers."""
     return found | {names[::-1]: seen_from_peer(one) for names, one in found.items()}
 
 
-def pairs_of(sees: BearingMeasurements) -> dict[Names, Pair]:
-    pair, _ = still_pair()
+def build_pairs(sees: BearingMeasurements) -> dict[Names, Pair]:
+    """Return two pairs of robot a at rest, which share the images of its camera."""
+    pair, _ = build_still_pair()
     return {
         ("a", "b"): replace(pair, own_bearings=sees),
         ("a", "c"): replace(pair, own_bearings=sees),
     }
 
 
-def bearings(sees: BearingMeasurements | None) -> Array:
+def list_bearings(sees: BearingMeasurements | None) -> Array:
+    """Return the distinct bearings of all candidates, radians."""
     assert sees is not None
     return np.unique(sees.bearing[np.isfinite(sees.bearing[..., 0]), 0])
 
 
 def test_conflicting_pair_is_resolved_without_shared_candidates() -> None:
-    pairs = pairs_of(candidates(LEFT, RIGHT))
-    found = both_ways({("a", "b"): at(LEFT), ("a", "c"): at(LEFT - 0.08)})
+    pairs = build_pairs(build_candidates(LEFT, RIGHT))
+    found = add_reversed(
+        {("a", "b"): build_estimate(LEFT), ("a", "c"): build_estimate(LEFT - 0.08)}
+    )
     (again,) = resolve_conflicts(pairs, found).items()
     assert again[0] == ("a", "c")
-    assert bearings(again[1].own_bearings) == pytest.approx([RIGHT])
-    assert bearings(pairs["a", "c"].own_bearings) == pytest.approx([RIGHT, LEFT])
+    assert list_bearings(again[1].own_bearings) == pytest.approx([RIGHT])
+    assert list_bearings(pairs["a", "c"].own_bearings) == pytest.approx([RIGHT, LEFT])
 
 
 def test_less_certain_pair_loses_the_conflict() -> None:
-    pairs = pairs_of(candidates(LEFT, RIGHT))
-    found = both_ways({("a", "b"): at(LEFT, 0.5), ("a", "c"): at(LEFT, 0.1)})
+    pairs = build_pairs(build_candidates(LEFT, RIGHT))
+    found = add_reversed(
+        {("a", "b"): build_estimate(LEFT, 0.5), ("a", "c"): build_estimate(LEFT, 0.1)}
+    )
     assert list(resolve_conflicts(pairs, found)) == [("a", "b")]
 
 
 def test_pairs_without_conflict_are_unchanged() -> None:
-    pairs = pairs_of(candidates(LEFT, RIGHT))
-    assert not resolve_conflicts(pairs, both_ways({("a", "b"): at(LEFT), ("a", "c"): at(RIGHT)}))
+    pairs = build_pairs(build_candidates(LEFT, RIGHT))
+    assert not resolve_conflicts(
+        pairs, add_reversed({("a", "b"): build_estimate(LEFT), ("a", "c"): build_estimate(RIGHT)})
+    )
     blind = {names: replace(pair, own_bearings=None) for names, pair in pairs.items()}
-    assert not resolve_conflicts(blind, both_ways({("a", "b"): at(LEFT), ("a", "c"): at(LEFT)}))
+    assert not resolve_conflicts(
+        blind, add_reversed({("a", "b"): build_estimate(LEFT), ("a", "c"): build_estimate(LEFT)})
+    )
 
 
 def test_conflicts_in_the_camera_of_the_second_robot_are_resolved() -> None:
-    pair, _ = still_pair()
-    sees = candidates(LEFT, RIGHT)
+    pair, _ = build_still_pair()
+    sees = build_candidates(LEFT, RIGHT)
     pairs = {
         ("a", "c"): replace(pair, peer_bearings=sees),
         ("b", "c"): replace(pair, peer_bearings=sees),
     }
-    ways = {("c", "a"): at(LEFT), ("c", "b"): at(LEFT + 0.08)}
-    (again,) = resolve_conflicts(pairs, both_ways(ways)).items()
+    ways = {("c", "a"): build_estimate(LEFT), ("c", "b"): build_estimate(LEFT + 0.08)}
+    (again,) = resolve_conflicts(pairs, add_reversed(ways)).items()
     assert again[0] == ("b", "c")
-    assert bearings(again[1].peer_bearings) == pytest.approx([RIGHT])
+    assert list_bearings(again[1].peer_bearings) == pytest.approx([RIGHT])
     assert again[1].own_bearings is None
 
 
 def test_images_without_candidates_are_dropped() -> None:
-    sees = candidates(LEFT)
+    sees = build_candidates(LEFT)
     gone = np.arange(len(TIMES_S)) < 3
     left = drop_candidates(sees, gone, np.zeros(len(TIMES_S), np.intp))
     assert left.time_s.tolist() == TIMES_S[3:].tolist()
@@ -114,7 +126,7 @@ def test_bearing_variance_follows_position_covariance() -> None:
 
 def test_association_likelihood_is_the_gaussian_density() -> None:
     place, spread = np.array([[2.0, 0.0, 0.0]]), 0.1**2 * np.eye(3)[None]
-    sees = candidates(0.1, 0.3)
+    sees = build_candidates(0.1, 0.3)
     one = BearingMeasurements(sees.time_s[:1], sees.bearing[:1], sees.std[:1])
     found = associate(one, place, spread)
     variance = STD**2 + 0.05**2

@@ -22,22 +22,22 @@ OWN_GYRO, PEER_GYRO = (PAIR_LAYOUT.find("gyro_bias", side) for side in (0, 1))
 RANGE_BIAS = PAIR_LAYOUT.find("range_offset", 0, 1)
 
 
-def prior(found: Array) -> ConstantPrior:
+def build_prior(found: Array) -> ConstantPrior:
     return ConstantPrior(found, USUAL, tuple(row.loss for row in ROWS))
 
 
-def information(rng: np.random.Generator, rank: int = SIZE) -> Array:
-    """Of a flight that tells so many combinations of its constants, some well and some hardly."""
+def draw_information(rng: np.random.Generator, rank: int = SIZE) -> Array:
+    """Draw the information of a flight about its constants, with a given rank and wide range."""
     rows = rng.normal(size=(rank, SIZE)) * rng.uniform(0.3, 10, (rank, 1)) / USUAL
     return np.asarray(rows.T @ rows)
 
 
-def solved(seen: Array, likeliest: Array) -> Estimate:
-    """What a solve says of a flight, whose prior holds the constants back."""
+def solve(seen: Array, likeliest: Array) -> Estimate:
+    """Return the estimate of a flight, whose prior pulls the constants towards zero."""
     noise, found = NoiseModel(), np.zeros(SIZE)
     for _ in range(200):
-        found = np.linalg.solve(seen + np.diag(prior(found).information()), seen @ likeliest)
-    covariance = np.linalg.inv(seen + np.diag(prior(found).curvature()))
+        found = np.linalg.solve(seen + np.diag(build_prior(found).information()), seen @ likeliest)
+    covariance = np.linalg.inv(seen + np.diag(build_prior(found).curvature()))
     state, spread, status = np.zeros((2, 3)), np.stack([np.eye(3)] * 2), np.zeros(2, np.int8)
     made = Estimate(np.arange(2.0), state, spread, status, found, noise)
     return replace(made, constants_covariance=covariance)
@@ -45,8 +45,8 @@ def solved(seen: Array, likeliest: Array) -> Estimate:
 
 def test_flight_information_excludes_the_prior() -> None:
     rng = np.random.default_rng(0)
-    seen, likeliest = information(rng), rng.normal(0, 0.5 * USUAL)
-    out = flight_information(solved(seen, likeliest), SUBJECTS, ALL)
+    seen, likeliest = draw_information(rng), rng.normal(0, 0.5 * USUAL)
+    out = flight_information(solve(seen, likeliest), SUBJECTS, ALL)
     scale = np.outer(USUAL, USUAL)
     assert out.information * scale == pytest.approx(seen * scale, rel=1e-6, abs=1e-6)
     assert out.information_vector * USUAL == pytest.approx(seen @ likeliest * USUAL, rel=1e-4)
@@ -54,13 +54,13 @@ def test_flight_information_excludes_the_prior() -> None:
 
 @pytest.mark.heavy
 def test_pooled_std_predicts_error_of_the_next_flight() -> None:
-    """Of many labs, whose robots' constants stay but for a little, as in their priors' units."""
+    """The constants of many robots vary by 0.3 of their prior std between flights."""
     rng = np.random.default_rng(1)
     off = []
     for _ in range(60):
         own = rng.normal(0, USUAL)
         flights = [own + rng.normal(0, 0.3 * USUAL) for _ in range(6)]
-        seen = [information(rng) for _ in flights]
+        seen = [draw_information(rng) for _ in flights]
         parts = [
             FlightInformation(one, one @ flight, ALL)
             for one, flight in zip(seen, flights, strict=True)
@@ -77,7 +77,7 @@ def test_pooling_assigns_a_common_difference_to_the_shared_robot() -> None:
     seen = np.outer(row, row)
     true = np.zeros(SIZE)
     true[PEER_GYRO] = 0.05
-    # Of a third robot too: who is in both pairs is the one.
+    # The second flight has another first robot, so the error belongs to the shared one.
     columns = [ALL, np.where(ALL == OWN_GYRO, SIZE, ALL)]
     rows = [*ROWS, ROWS[OWN_GYRO]]
     found = pool_flights([FlightInformation(seen, seen @ true, column) for column in columns], rows)
@@ -103,12 +103,12 @@ def test_constant_that_varies_between_flights_keeps_a_wide_std() -> None:
 
 def test_constants_beside_those_asked_for_are_marginalized() -> None:
     rng = np.random.default_rng(2)
-    seen, likeliest = information(rng), rng.normal(0, 0.5 * USUAL)
-    made = solved(seen, likeliest)
+    seen, likeliest = draw_information(rng), rng.normal(0, 0.5 * USUAL)
+    made = solve(seen, likeliest)
     kept = [k for k, (name, _) in enumerate(SUBJECTS) if name != "height_offset"]
     out = flight_information(made, [SUBJECTS[k] for k in kept], np.arange(len(kept)))
     rest = [k for k in ALL if k not in kept]
-    held = seen + np.diag(prior(made.constants).curvature())
+    held = seen + np.diag(build_prior(made.constants).curvature())
     wanted = seen[np.ix_(kept, kept)] - seen[np.ix_(kept, rest)] @ np.linalg.solve(
         held[np.ix_(rest, rest)], seen[np.ix_(rest, kept)]
     )

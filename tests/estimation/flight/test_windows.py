@@ -1,4 +1,4 @@
-"""Long flights in windows: joined without a seam, and with a carried prior."""
+"""Long flights are solved in windows, with a prior carried from each window to the next."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -14,8 +14,8 @@ from dmrl.estimation.model.status import OK
 from dmrl.estimation.solver.levenberg_marquardt import Solver
 from dmrl.estimation.solver.residuals import Values
 
-from ..flights import flown, pair_of, truth_at
-from ..solver.test_residuals import flight
+from ..flights import build_pair, compute_truth, simulate_flight
+from ..solver.test_residuals import build_flight
 
 
 def test_windows_cover_a_flight_and_overlap() -> None:
@@ -32,9 +32,8 @@ def test_windows_cover_a_flight_and_overlap() -> None:
     assert whole.is_last
 
 
-def test_carried_prior_equals_information_of_earlier_keyframes() -> None:
-    """With the later measurements it gives the covariance of all of them together."""
-    problem, values = flight()
+def test_carried_prior_informs_the_relative_position_only() -> None:
+    problem, values = build_flight()
     values = Values(values.state, values.constants)
     solver = Solver(replace(problem, views=()))
     layout = solver.layout
@@ -47,7 +46,7 @@ def test_carried_prior_equals_information_of_earlier_keyframes() -> None:
     assert carried.information.shape == (size, size)
     assert carried.convert(layout) == carried
     assert np.linalg.eigvalsh(carried.information).min() > -1e-6
-    # Information about the relative position is there, about the absolute one is not.
+    # There is information about the relative position, but not about the absolute one.
     absolute = np.zeros(size)
     absolute[[0, 3]] = 1.0
     relative = np.zeros(size)
@@ -58,8 +57,8 @@ def test_carried_prior_equals_information_of_earlier_keyframes() -> None:
 
 
 def test_carried_prior_does_not_depend_on_the_frame_of_its_window() -> None:
-    """The frame of the next window begins at the first robot: a turned flight carries the same."""
-    problem, values = flight()
+    """A turned and shifted flight carries the same prior."""
+    problem, values = build_flight()
     solver, by = Solver(problem), 0.7
     turned = values.state.copy()
     for robot in range(2):
@@ -78,8 +77,8 @@ def test_carried_prior_does_not_depend_on_the_frame_of_its_window() -> None:
 
 @pytest.mark.heavy
 def test_windowed_solve_is_as_accurate_as_whole_flight(monkeypatch: pytest.MonkeyPatch) -> None:
-    world = flown("random", "calibrated", 1002, 80.0)
-    pair = pair_of(world)
+    world = simulate_flight("random", "calibrated", 1002, 80.0)
+    pair = build_pair(world)
     (whole,) = estimate_pairs([pair])
     monkeypatch.setattr(windows, "WINDOW_S", 30.0)
     monkeypatch.setattr(windows, "OVERLAP_S", 14.0)
@@ -87,7 +86,7 @@ def test_windowed_solve_is_as_accurate_as_whole_flight(monkeypatch: pytest.Monke
     (parts,) = estimate_pairs([pair])
     assert parts[0].time_s == pytest.approx(whole[0].time_s)
     errors = [
-        np.hypot(*(found[0].state[:, :2] - truth_at(world, found[0].time_s)).T)
+        np.hypot(*(found[0].state[:, :2] - compute_truth(world, found[0].time_s)).T)
         for found in (whole, parts)
     ]
     rms = [float(np.sqrt((error**2).mean())) for error in errors]
@@ -101,9 +100,9 @@ def test_windowed_solve_is_as_accurate_as_whole_flight(monkeypatch: pytest.Monke
 def test_a_carried_prior_keeps_a_bearing_that_the_window_leaves_open(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """The observer rests after a minute: its bearing is known from before, for a while."""
-    world = flown("random", "calibrated", 1002, 60.0)
-    pair = pair_of(world)
+    """Positions late in the flight are more certain if the earlier window is carried over."""
+    world = simulate_flight("random", "calibrated", 1002, 60.0)
+    pair = build_pair(world)
     monkeypatch.setattr(windows, "WINDOW_S", 30.0)
     monkeypatch.setattr(windows, "OVERLAP_S", 10.0)
     kept = estimate_pairs([pair])[0][0]

@@ -28,7 +28,7 @@ def test_a_range_from_before_the_last_one_is_not_usable() -> None:
     ]
 
 
-def test_pair_drops_non_finite_and_backward_samples() -> None:
+def test_inconsistent_pairs_are_refused() -> None:
     Pair(GRID, STILL, STILL, np.array([0.5]), np.array([1.0]))
     with pytest.raises(ValueError, match="time order"):
         Pair(GRID, STILL, STILL, np.array([0.5]), np.array([-1.0]))
@@ -38,7 +38,7 @@ def test_pair_drops_non_finite_and_backward_samples() -> None:
         Pair(GRID, STILL, STILL, np.array([0.5]), np.array([1.0, 2.0]))
     with pytest.raises(ValueError, match="not uniform and increasing"):
         Pair(GRID[::-1], STILL, STILL, np.array([0.5]), np.array([1.0]))
-    for at in (0.105, 0.11):  # a step that is longer, and one that is none
+    for at in (0.105, 0.11):  # a longer step, and a step of zero
         with pytest.raises(ValueError, match="not uniform and increasing"):
             uneven = np.where(np.arange(200) == 10, at, GRID)
             Pair(uneven, STILL, STILL, np.array([0.5]), np.array([1.0]))
@@ -60,7 +60,7 @@ def test_a_pair_seen_from_the_peer_has_the_same_ranges() -> None:
 def test_resampling_drops_non_finite_and_backward_samples() -> None:
     time_s = np.array([0.0, 0.1, 0.2, 0.15, 0.3])
     values = np.array([[0.0], [1.0], [np.nan], [99.0], [3.0]])
-    # 0.15 comes after 0.2, so it is out, although 0.2 itself has no value.
+    # The sample at 0.15 follows that at 0.2, so it is dropped, although 0.2 has no value.
     signal, gap = resample(time_s, values, np.array([0.0, 0.2, 0.3]))
     assert signal[:, 0].tolist() == pytest.approx([0.0, 2.0, 3.0])
     assert not gap.any()

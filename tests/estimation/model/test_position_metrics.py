@@ -15,8 +15,10 @@ from dmrl.estimation.model.position_metrics import (
 from dmrl.geometry.frames import Array
 
 
-def judged(error_m: Array, std_m: float = 0.1, kept: bool | Array = True) -> EvaluatedPositions:
-    """Errors at 10 Hz, one and a half metres away."""
+def build_evaluated(
+    error_m: Array, std_m: float = 0.1, kept: bool | Array = True
+) -> EvaluatedPositions:
+    """Return positions of a peer 1.5 m away with these errors, at 10 Hz."""
     count = len(error_m)
     return EvaluatedPositions(
         time_s=np.arange(count) / 10,
@@ -31,7 +33,7 @@ def test_consistent_estimator_has_nees_2_and_coverage_95_percent() -> None:
     rng = np.random.default_rng(0)
     covariance = np.array([[0.04, 0.015], [0.015, 0.01]])
     errors = rng.multivariate_normal(np.zeros(2), covariance, 20_000)
-    honest = judged(errors)
+    honest = build_evaluated(errors)
     honest = EvaluatedPositions(
         honest.time_s,
         errors,
@@ -49,7 +51,7 @@ def test_errors_before_settling_affect_gate_figures_only() -> None:
     errors = np.zeros((100, 2))
     errors[:50, 0] = 5.0
     kept = np.arange(100) >= 40
-    found = compute_figures(judged(errors, kept=kept), settle_s=5.0)
+    found = compute_figures(build_evaluated(errors, kept=kept), settle_s=5.0)
     assert (found.rmse_m, found.p95_m, found.wrong_basin, found.nees) == (0.0, 0.0, 0.0, 0.0)
     assert (found.kept, found.good) == (0.6, 0.5)
     assert found.precision == pytest.approx(50 / 60)
@@ -58,29 +60,29 @@ def test_errors_before_settling_affect_gate_figures_only() -> None:
 
 
 def test_a_mirrored_solution_is_a_wrong_basin() -> None:
-    found = compute_figures(judged(np.tile([0.0, 2.0], (100, 1))), 0.0)
+    found = compute_figures(build_evaluated(np.tile([0.0, 2.0], (100, 1))), 0.0)
     assert found.wrong_basin == 1.0
-    assert compute_figures(judged(np.tile([0.0, 0.5], (100, 1))), 0.0).wrong_basin == 0.0
+    assert compute_figures(build_evaluated(np.tile([0.0, 0.5], (100, 1))), 0.0).wrong_basin == 0.0
 
 
 def test_covariances_that_are_unknown_or_exact_are_not_judged() -> None:
     for std_m in (0.0, np.nan):
-        found = compute_figures(judged(np.full((10, 2), 0.1), std_m), 0.0)
+        found = compute_figures(build_evaluated(np.full((10, 2), 0.1), std_m), 0.0)
         assert np.isnan(found.nees)
         assert np.isnan(found.coverage_95)
         assert found.kept == 1.0
 
 
 def test_metrics_without_data_are_nan() -> None:
-    found = compute_figures(judged(np.ones((10, 2)), kept=False), settle_s=100.0)
+    found = compute_figures(build_evaluated(np.ones((10, 2)), kept=False), settle_s=100.0)
     assert np.isnan([found.rmse_m, found.wrong_basin, found.precision, found.recall]).all()
     assert np.isnan(combine_figures([found]).precision)
 
 
 def test_over_all_pairs_every_sample_counts_once() -> None:
-    one = compute_figures(judged(np.zeros((100, 2))), 0.0)
-    other = compute_figures(judged(np.full((300, 2), 0.5), kept=np.arange(300) < 60), 0.0)
-    none = compute_figures(judged(np.zeros((100, 2)), kept=False), 0.0)
+    one = compute_figures(build_evaluated(np.zeros((100, 2))), 0.0)
+    other = compute_figures(build_evaluated(np.full((300, 2), 0.5), kept=np.arange(300) < 60), 0.0)
+    none = compute_figures(build_evaluated(np.zeros((100, 2)), kept=False), 0.0)
     every = combine_figures([one, other, none])
     assert every.samples == 500
     assert every.kept == pytest.approx(160 / 500)
@@ -103,7 +105,7 @@ def test_truth_covers_times_between_dense_samples() -> None:
 
 def test_figures_equal_a_direct_computation() -> None:
     rng = np.random.default_rng(5)
-    count, settle_s = 101, 3.0  # one sample stands at the border, and counts
+    count, settle_s = 101, 3.0  # one sample is exactly at 3 s, and counts
     root = rng.normal(size=(count, 2, 2)) * 0.2
     found = EvaluatedPositions(
         np.arange(count) / 10,
@@ -142,9 +144,9 @@ def test_figures_equal_a_direct_computation() -> None:
 @pytest.mark.parametrize(("share", "wrong"), [(0.49, 0.0), (0.51, 1.0)])
 def test_median_error_over_half_the_distance_is_a_wrong_basin(share: float, wrong: float) -> None:
     errors = np.tile([0.0, 1.5 * share], (9, 1))
-    assert compute_figures(judged(errors), 0.0).wrong_basin == wrong
-    errors[:4] = 1.5 * (1 - share)  # fewer than half of them say nothing
-    assert compute_figures(judged(errors), 0.0).wrong_basin == wrong
+    assert compute_figures(build_evaluated(errors), 0.0).wrong_basin == wrong
+    errors[:4] = 1.5 * (1 - share)  # fewer than half of the samples do not change the median
+    assert compute_figures(build_evaluated(errors), 0.0).wrong_basin == wrong
 
 
 @pytest.mark.parametrize(
@@ -152,7 +154,7 @@ def test_median_error_over_half_the_distance_is_a_wrong_basin(share: float, wron
     [[[1, 1], [1, 1]], [[-1, 0], [0, -1]], [[-1, 0], [0, 1]], [[0, 0], [0, 1]], [[1, 2], [2, 1]]],
 )
 def test_invalid_covariance_gives_nan_mahalanobis_distance(covariance: list[list[float]]) -> None:
-    one = replace(judged(np.array([[1.0, 0.0]])), covariance=np.array([covariance], float))
+    one = replace(build_evaluated(np.array([[1.0, 0.0]])), covariance=np.array([covariance], float))
     assert np.isnan(mahalanobis_squared(one)).all()
 
 

@@ -13,7 +13,7 @@ from dmrl.estimation.search.hypotheses import (
 from dmrl.estimation.search.pair_filter import HYPOTHESIS_STD
 from dmrl.estimation.solver.keyframes import build_problem
 
-from ..flights import flown, pair_of, truth_at
+from ..flights import build_pair, compute_truth, simulate_flight
 
 
 def test_hypotheses_cover_the_range_circle() -> None:
@@ -50,11 +50,11 @@ def test_states_are_compared_at_both_ends_modulo_full_turns() -> None:
 
 @pytest.mark.heavy
 def test_most_likely_track_is_near_the_truth() -> None:
-    flight = flown("random", "calibrated", 1001, 60.0)
-    problem = build_problem({(0, 1): pair_of(flight)})
+    flight = simulate_flight("random", "calibrated", 1001, 60.0)
+    problem = build_problem({(0, 1): build_pair(flight)})
     tracks = follow_hypotheses(problem)
     assert len(tracks) == 2 * KEPT_HYPOTHESES
-    true = truth_at(flight, problem.keyframe_s)
+    true = compute_truth(flight, problem.keyframe_s)
     assert [t.score for t in tracks] == sorted((t.score for t in tracks), reverse=True)
     error = np.hypot(*(tracks[0].pose[:, :2] - true).T)
     assert np.median(error) < 0.3

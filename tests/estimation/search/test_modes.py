@@ -1,4 +1,4 @@
-"""Modes of a flight: solved, mirrored, and kept if nearly as good."""
+"""Modes of a flight: mirrored copies, and the selection of distinct, likely ones."""
 
 from dataclasses import replace
 
@@ -23,23 +23,23 @@ from dmrl.estimation.solver.keyframes import build_problem
 from dmrl.estimation.solver.levenberg_marquardt import MapEstimate, relative_path
 from dmrl.estimation.solver.residuals import Values
 
-from ..flights import flown, pair_of, truth_at
-from ..solver.test_residuals import flight, moved
+from ..flights import build_pair, compute_truth, simulate_flight
+from ..solver.test_residuals import build_flight, perturb
 
 
-def straight(nearest_m: float) -> np.ndarray:
-    """A peer that passes along x at a distance, 4 s at 5 keyframes a second."""
+def build_pass(nearest_m: float) -> np.ndarray:
+    """Return the (21, 3) path of a peer that passes along x at a distance, at 5 keyframes/s."""
     along = np.linspace(-2, 2, 21)
     return np.column_stack([along, np.full(21, nearest_m), np.zeros(21)])
 
 
 def test_mirror_copy_flips_a_close_pass_only() -> None:
-    path = straight(0.2)
+    path = build_pass(0.2)
     (copy,) = mirror_copies(path, 5.0)
     assert copy[10] == pytest.approx([0.0, -0.2, 0.0])
     assert copy[[0, -1]] == pytest.approx(path[[0, -1]])
     assert copy[:, 0] == pytest.approx(path[:, 0])
-    assert not mirror_copies(straight(MAX_PASS_M + 0.05), 5.0)
+    assert not mirror_copies(build_pass(MAX_PASS_M + 0.05), 5.0)
 
 
 def test_mirror_copies_swap_side_between_close_passes() -> None:
@@ -55,7 +55,7 @@ def test_mirror_copies_swap_side_between_close_passes() -> None:
 
 
 def test_nearest_pass_is_mirrored_first() -> None:
-    path = np.concatenate([straight(0.4), straight(0.1), straight(0.3)])
+    path = np.concatenate([build_pass(0.4), build_pass(0.1), build_pass(0.3)])
     path[:, 0] = np.concatenate([np.linspace(-2, 2, 21) * way for way in (1, -1, 1)])
     first = mirror_copies(path, 5.0)[0]
     assert first[31, 1] == pytest.approx(-0.1)
@@ -63,7 +63,7 @@ def test_nearest_pass_is_mirrored_first() -> None:
 
 
 def test_modes_are_distinct_and_nearly_as_good_as_the_best() -> None:
-    _, true = flight()
+    _, true = build_flight()
 
     def at(y_m: float, cost: float) -> MapEstimate:
         state = true.state.copy()
@@ -77,12 +77,12 @@ def test_modes_are_distinct_and_nearly_as_good_as_the_best() -> None:
 
 
 def test_coarse_problem_has_one_range_per_keyframe_and_white_noise() -> None:
-    problem, true = flight()
+    problem, true = build_flight()
     coarse = coarsen(problem)
     assert len(coarse.links[0].range_m) <= len(problem.keyframe_s)
     assert coarse.velocity_psd == pytest.approx(problem.velocity_psd)
     assert coarse.layout.state_column("velocity_error_x", 0) is None
-    values = moved(true)
+    values = perturb(true)
     there = convert_values(values, problem.layout, coarse.layout)
     back = convert_values(there, coarse.layout, problem.layout)
     assert (back.state[:, :6] == values.state[:, :6]).all()
@@ -93,7 +93,7 @@ def test_coarse_problem_has_one_range_per_keyframe_and_white_noise() -> None:
 
 
 def test_values_are_built_from_a_track_or_from_dead_reckoning() -> None:
-    problem, true = flight()
+    problem, true = build_flight()
     path = relative_path(true.state)
     found = place_peer(problem, path, np.array([0.01, -0.02]))
     assert relative_path(found.state) == pytest.approx(path, abs=1e-9)
@@ -119,20 +119,20 @@ def test_composite_track_takes_the_most_likely_segments() -> None:
 
 @pytest.mark.heavy
 def test_the_modes_of_a_flight_contain_the_truth() -> None:
-    world = flown("random", "calibrated", 1001, 60.0)
-    problem = build_problem({(0, 1): pair_of(world)})
+    world = simulate_flight("random", "calibrated", 1001, 60.0)
+    problem = build_problem({(0, 1): build_pair(world)})
     modes = find_modes(problem)
-    error = relative_path(modes[0].values.state)[:, :2] - truth_at(world, problem.keyframe_s)
+    error = relative_path(modes[0].values.state)[:, :2] - compute_truth(world, problem.keyframe_s)
     assert np.sqrt((error**2).sum(axis=1).mean()) < 0.2
     assert [m.cost for m in modes] == sorted(m.cost for m in modes)
 
 
 @pytest.mark.heavy
 def test_too_short_ranges_do_not_collapse_the_solve() -> None:
-    world = flown("in_view", "calibrated", 1003, 60.0)
-    pair = pair_of(world)
+    world = simulate_flight("in_view", "calibrated", 1003, 60.0)
+    pair = build_pair(world)
     short = replace(pair, range_m=np.maximum(pair.range_m - 0.4, 0.02))
     problem = build_problem({(0, 1): short})
     error = relative_path(find_modes(problem)[0].values.state)[:, :2]
-    error = error - truth_at(world, problem.keyframe_s)
+    error = error - compute_truth(world, problem.keyframe_s)
     assert np.sqrt((error**2).sum(axis=1).mean()) < 0.35

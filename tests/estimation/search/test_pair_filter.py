@@ -1,4 +1,4 @@
-"""The pair filter: forward, backward, and its updates."""
+"""The pair filter: forward and backward prediction, updates and smoothing."""
 
 from dataclasses import replace
 
@@ -17,25 +17,26 @@ from dmrl.estimation.search.pair_filter import (
 )
 from dmrl.estimation.solver.levenberg_marquardt import relative_path
 
-from ..solver.test_residuals import flight
+from ..solver.test_residuals import build_flight
 
 ONE = np.zeros(1, np.intp)
 
 
-def inputs() -> tuple[FilterInputs, np.ndarray]:
-    """Inputs of an exact flight, and its true relative path."""
-    problem, values = flight()
+def build_exact_inputs() -> tuple[FilterInputs, np.ndarray]:
+    """Return the inputs of an exact flight, and its true relative path."""
+    problem, values = build_flight()
     return build_inputs(replace(problem, views=())), relative_path(values.state)
 
 
-def lanes(count: int) -> list[Lane]:
+def build_lanes(count: int) -> list[Lane]:
+    """Return a forward and a backward lane over all keyframes."""
     return [Lane(np.arange(count), True), Lane(np.arange(count)[::-1], False)]
 
 
 @pytest.mark.parametrize("way", [0, 1])
 def test_filter_started_at_truth_stays_there_in_both_directions(way: int) -> None:
-    made, true = inputs()
-    lane = lanes(len(true))[way]
+    made, true = build_exact_inputs()
+    lane = build_lanes(len(true))[way]
     run = run_lanes(made, [lane], true[lane.keyframe[:1]], ONE, len(true))
     error = run.state[:, 0, :3] - true[lane.keyframe]
     assert np.abs(error[:, :2]).max() < 0.03
@@ -44,7 +45,7 @@ def test_filter_started_at_truth_stays_there_in_both_directions(way: int) -> Non
 
 
 def test_backward_prediction_inverts_forward_prediction() -> None:
-    made, true = inputs()
+    made, true = build_exact_inputs()
     blind = replace(made, range_m=np.full(len(true), np.nan))
     ahead = run_lanes(blind, [Lane(np.arange(5, 9), True)], true[5:6], ONE, 4)
     there = ahead.state[-1, :, :3]
@@ -54,25 +55,25 @@ def test_backward_prediction_inverts_forward_prediction() -> None:
 
 
 def test_bias_jacobian_changes_sign_backward_in_time() -> None:
-    made, true = inputs()
+    made, true = build_exact_inputs()
     blind = replace(made, range_m=np.full(len(true), np.nan))
     step = 1e-6
     for lane in (Lane(np.arange(5, 9), True), Lane(np.arange(8, 4, -1), False)):
         run = run_lanes(blind, [lane], true[lane.keyframe[:1]], ONE, 4)
-        # The Jacobian of the step is that of finite differences of the propagation.
+        # The Jacobian of the step equals finite differences of the propagation.
         for column in range(3):
             moved = true[lane.keyframe[:1]].copy()
             moved[0, column] += step
             ends = run_lanes(blind, [lane], moved, ONE, 2).state[1, 0]
             slope = (ends - run.state[1, 0]) / step
             assert run.step[1, 0, :, column] == pytest.approx(slope, abs=1e-4)
-        # A step back from keyframe 8 is that from 7.
+        # The step back from keyframe 8 has the length of the step forward from 7.
         seconds = made.step_s[5] if lane.forwards else -made.step_s[7]
         assert run.step[1, 0, 2, 3:] == pytest.approx([seconds, -seconds])
 
 
 def test_range_update_is_radial_and_robust() -> None:
-    made, true = inputs()
+    made, true = build_exact_inputs()
     results = []
     for excess in (0.0, 0.2, 5.0):
         longer = replace(made, range_m=made.range_m + excess)
@@ -94,7 +95,7 @@ def test_range_update_is_radial_and_robust() -> None:
 
 
 def test_bearing_update_rotates_the_peer_to_the_detection() -> None:
-    problem, values = flight()
+    problem, values = build_flight()
     true = relative_path(values.state)
     made = build_inputs(problem)
     key = min(made.images)
@@ -119,7 +120,7 @@ def test_bearing_update_rotates_the_peer_to_the_detection() -> None:
 
 
 def test_parallel_lanes_equal_single_lanes_and_short_ones_stay_constant() -> None:
-    made, true = inputs()
+    made, true = build_exact_inputs()
     both = [Lane(np.arange(len(true)), True), Lane(np.arange(3, -1, -1), False)]
     start = np.stack([true[0], true[3]])
     run = run_lanes(made, both, start, np.arange(2), len(true))
@@ -135,7 +136,7 @@ def test_parallel_lanes_equal_single_lanes_and_short_ones_stay_constant() -> Non
 
 
 def test_smoothing_carries_later_ranges_back() -> None:
-    made, true = inputs()
+    made, true = build_exact_inputs()
     wrong = true[:1] + np.array([0.25, -0.2, 0.3])
     run = run_lanes(made, [Lane(np.arange(len(true)), True)], wrong, ONE, len(true))
     smooth = smooth_rts(run)

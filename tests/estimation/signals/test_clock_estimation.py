@@ -20,8 +20,8 @@ Array = np.ndarray
 OFFSET_S, DRIFT = 0.080, 20e-6
 
 
-def distance(time_s: Array, seed: int) -> Array:
-    """A distance of two robots that fly about, metres."""
+def compute_distance(time_s: Array, seed: int) -> Array:
+    """Return a varying distance of two robots, metres."""
     rng = np.random.default_rng(seed)
     waves = [
         rng.uniform(0.1, 0.4) * np.sin(rng.uniform(0.1, 2.0) * time_s + rng.uniform(0, 6))
@@ -30,44 +30,44 @@ def distance(time_s: Array, seed: int) -> Array:
     return 3.0 + np.sum(waves, axis=0)
 
 
-def wrong(time_s: Array) -> Array:
-    """Times of a clock that is 80 ms ahead in the middle of five minutes and 20 ppm fast."""
+def to_wrong_clock(time_s: Array) -> Array:
+    """Return the times of a clock that is 20 ppm fast, and 80 ms ahead at 150 s."""
     return time_s + OFFSET_S + DRIFT * (time_s - 150)
 
 
-def exchanges(seed: int) -> tuple[Array, Array, Array, Array]:
-    """Five minutes of 25 exchanges a second, each logged by both some ms later, 10 % lost."""
+def simulate_exchanges(seed: int) -> tuple[Array, Array, Array, Array]:
+    """Simulate range exchanges for 5 min at 25 Hz, logged with up to 10 ms delay and 10 % loss."""
     rng = np.random.default_rng(seed)
     time = np.cumsum(rng.uniform(0.03, 0.05, 7500))
     time = time[time < 300]
-    measured = np.round(distance(time, seed) + rng.normal(0, 0.1, len(time)), 3)
+    measured = np.round(compute_distance(time, seed) + rng.normal(0, 0.1, len(time)), 3)
     measured[rng.random(len(time)) < 0.03] += 1.5  # no line of sight
     here, there = rng.random((2, len(time))) > 0.1
     return (
         (time + rng.uniform(0, 0.01, len(time)))[here],
         measured[here],
-        wrong(time + rng.uniform(0, 0.01, len(time)))[there],
+        to_wrong_clock(time + rng.uniform(0, 0.01, len(time)))[there],
         measured[there],
     )
 
 
-def worst_s(clock: Clock | None) -> float:
-    """Largest error of the corrected clock in the five minutes."""
+def compute_worst_error_s(clock: Clock | None) -> float:
+    """Return the largest error of the corrected clock within five minutes, seconds."""
     assert clock is not None
     time = np.linspace(0, 300, 61)
-    return float(np.abs(clock.correct_times(wrong(time)) - time).max())
+    return float(np.abs(clock.correct_times(to_wrong_clock(time)) - time).max())
 
 
 @pytest.mark.parametrize("seed", range(5))
 def test_clock_is_recovered_within_5_ms_over_5_minutes(seed: int) -> None:
-    clock = estimate_from_exchanges(*exchanges(seed))
-    assert worst_s(clock) < 0.005
+    clock = estimate_from_exchanges(*simulate_exchanges(seed))
+    assert compute_worst_error_s(clock) < 0.005
     assert clock is not None and clock.sigma_s < 0.001
 
 
 @pytest.mark.parametrize("apart_s", [-40.0, 3600.0])
 def test_clocks_may_be_far_apart(apart_s: float) -> None:
-    here, range_m, there, peer_m = exchanges(0)
+    here, range_m, there, peer_m = simulate_exchanges(0)
     clock = estimate_from_exchanges(here, range_m, there + apart_s, peer_m)
     assert clock is not None
     assert clock.offset_s == pytest.approx(-OFFSET_S - apart_s, abs=0.005)
@@ -81,9 +81,9 @@ def test_clock_sigma_is_consistent_for_independent_ranges() -> None:
         here, there = (np.sort(rng.uniform(0, 300, 9000)) for _ in range(2))
         clock = estimate_from_exchanges(
             here,
-            distance(here, seed) + rng.normal(0, 0.1, 9000),
-            wrong(there),
-            distance(there, seed) + rng.normal(0, 0.1, 9000) + 0.2,
+            compute_distance(here, seed) + rng.normal(0, 0.1, 9000),
+            to_wrong_clock(there),
+            compute_distance(there, seed) + rng.normal(0, 0.1, 9000) + 0.2,
         )
         assert clock is not None
         errors.append((clock.offset_s + OFFSET_S) / clock.sigma_s)
@@ -91,22 +91,22 @@ def test_clock_sigma_is_consistent_for_independent_ranges() -> None:
 
 
 def test_clock_alignment_is_independent_of_signal_scale() -> None:
-    """As the turn that a camera saw, in pixels, against a gyroscope."""
+    """For example, image motion in pixels is aligned with a gyroscope."""
     time, rng = np.arange(0, 300, 0.01), np.random.default_rng(3)
     seen = np.arange(0, 300, 0.05)
-    turn = distance(time, 5) - 3
-    pixels = 9.2 * (distance(seen, 5) - 3) + rng.normal(0, 0.3, len(seen))
-    assert worst_s(estimate_clock(time, turn, wrong(seen), pixels)) < 0.005
+    turn = compute_distance(time, 5) - 3
+    pixels = 9.2 * (compute_distance(seen, 5) - 3) + rng.normal(0, 0.3, len(seen))
+    assert compute_worst_error_s(estimate_clock(time, turn, to_wrong_clock(seen), pixels)) < 0.005
 
 
 @pytest.mark.parametrize("count", [0, 5, 100])
 def test_clock_needs_enough_exchanges(count: int) -> None:
-    here, range_m, there, peer_m = exchanges(0)
+    here, range_m, there, peer_m = simulate_exchanges(0)
     assert estimate_from_exchanges(here, range_m, there[:count], peer_m[:count]) is None
 
 
 def test_uncorrelated_ranges_give_no_clock() -> None:
-    here, range_m, there, _ = exchanges(0)
+    here, range_m, there, _ = simulate_exchanges(0)
     noise = np.random.default_rng(0).normal(size=len(there))
     assert estimate_from_exchanges(here, range_m, there, noise) is None
 
@@ -155,29 +155,29 @@ def test_random_offset_and_drift_are_recovered(
 ) -> None:
     seen_s, also_s = np.arange(0, 60, 0.05), np.arange(0.02, 60, 0.07)
     stamps = also_s + offset_s + drift * (also_s - 30)
-    values = scale * distance(also_s, seed) + 1.0
-    clock = estimate_clock(seen_s, distance(seen_s, seed), stamps, values)
+    values = scale * compute_distance(also_s, seed) + 1.0
+    clock = estimate_clock(seen_s, compute_distance(seen_s, seed), stamps, values)
     assert clock is not None
     assert np.abs(clock.correct_times(stamps) - also_s).max() < 0.01
 
 
 @pytest.mark.parametrize("cut_s", [12.0, -12.0])
 def test_clocks_need_not_begin_together(cut_s: float) -> None:
-    """What one saw before the other began is a lag in either direction."""
+    """Either clock may start 12 s before the other."""
     seen_s, also_s = np.arange(0, 90, 0.05), np.arange(0.02, 90, 0.07)
     seen_s, also_s = seen_s[seen_s > cut_s], also_s[also_s > -cut_s]
     stamps = also_s + 3.3
-    clock = estimate_clock(seen_s, distance(seen_s, 4), stamps, distance(also_s, 4))
+    clock = estimate_clock(seen_s, compute_distance(seen_s, 4), stamps, compute_distance(also_s, 4))
     assert clock is not None
     assert np.abs(clock.correct_times(stamps) - also_s).max() < 0.01
     assert also_s[0] - 1 < clock.at_s - 3.3 < also_s[-1] + 1
 
 
 def test_offset_and_drift_have_separate_stds() -> None:
-    for one in (exchanges(0), exchanges(1)):
+    for one in (simulate_exchanges(0), simulate_exchanges(1)):
         clock = estimate_from_exchanges(*one)
         assert clock is not None
-        # An offset is known as well as a line's middle, a drift by the spread of its times.
+        # In a line fit, the ratio of both stds is the standard deviation of the times.
         assert clock.sigma_s / clock.sigma_drift == pytest.approx(300 / 12**0.5, rel=0.1)
         assert clock.sigma_s == pytest.approx(0.01 / 6**0.5 / len(one[2]) ** 0.5, rel=1.0)
         assert abs(clock.drift + DRIFT) < 5 * clock.sigma_drift
@@ -208,7 +208,7 @@ def test_resampled_series_rejects_outliers_and_marks_gaps() -> None:
     clean, heard = (Series.from_samples(time_s, v) for v in (values, spoilt))
     assert clean is not None and heard is not None
     assert np.abs(heard.values - clean.values).max() < 0.05
-    inner = slice(30, -30)  # the ends stand for what lies beyond them
+    inner = slice(30, -30)  # the ends are affected by padding
     assert clean.values[inner] == pytest.approx(np.sin(clean.time_s[inner] / 3), abs=0.08)
     assert clean.time_s[0] == 0.0 and np.diff(clean.time_s) == pytest.approx(GRID_STEP_S)
     unknown = clean.time_s[~clean.known]
@@ -239,7 +239,7 @@ def test_clock_series_needs_twenty_seconds(lasts_s: float, enough: bool) -> None
 
 @given(st.lists(st.floats(-5, 5), min_size=1, max_size=30))
 def test_trend_is_a_running_mean_with_repeated_ends(values: list[float]) -> None:
-    """Of series shorter than its window here: the mean of what lies around, ends repeated."""
+    """The series here are shorter than the window, which is then reduced to their length."""
     array = np.array(values)
     width = min(int(TREND_WINDOW_S / GRID_STEP_S), len(array)) | 1
     padded = [array[0]] * (width // 2) + values + [array[-1]] * (width // 2)

@@ -6,8 +6,8 @@ from dmrl.estimation.signals.image_motion import estimate_shift, shift_rates, sh
 RNG = np.random.default_rng(2)
 
 
-def scene(right: float, down: float) -> np.ndarray:
-    """Things of all sizes, moved by parts of a pixel, (56, 80) of a wider world."""
+def draw_scene(right: float, down: float) -> np.ndarray:
+    """Return a (56, 80) crop of a random texture with all spatial scales, shifted in pixels."""
     world = np.fft.fft2(np.random.default_rng(7).normal(size=(112, 160)))
     v, u = np.meshgrid(np.fft.fftfreq(112), np.fft.fftfreq(160), indexing="ij")
     size = 1 / np.maximum(np.hypot(u, v), 0.01)
@@ -18,7 +18,7 @@ def scene(right: float, down: float) -> np.ndarray:
 @pytest.mark.parametrize("moved", [(0.0, 0.0), (3.4, -1.7), (-12.3, 5.5), (0.2, 9.0)])
 def test_a_shift_is_found_to_a_fifth_of_a_pixel(moved: tuple[float, float]) -> None:
     noise = RNG.normal(0, 0.2, (2, 56, 80))
-    found = estimate_shift(scene(0, 0) + noise[0], scene(*moved) + noise[1])
+    found = estimate_shift(draw_scene(0, 0) + noise[0], draw_scene(*moved) + noise[1])
     assert found == pytest.approx(moved, abs=0.2)
 
 

@@ -6,14 +6,15 @@ from dmrl.estimation.signals.jump_detection import remove_height_steps, step_off
 TIME_S = np.arange(0, 60, 0.01)
 
 
-def climbing(noise_m: float) -> np.ndarray:
+def simulate_heights(noise_m: float) -> np.ndarray:
+    """Return heights that vary by 0.3 m, with noise."""
     noise = np.random.default_rng(0).normal(0, noise_m, len(TIME_S))
     return np.asarray(1 + 0.3 * np.sin(TIME_S) + noise)
 
 
 @pytest.mark.parametrize("noise_m", [0.0, 0.02, 0.03])
 def test_height_steps_over_a_box_are_removed(noise_m: float) -> None:
-    floor = climbing(noise_m)
+    floor = simulate_heights(noise_m)
     over = ((TIME_S > 10) & (TIME_S < 12)) | ((TIME_S > 30) & (TIME_S < 31.5))
     found = remove_height_steps(TIME_S, floor - 0.35 * over)
     off = np.abs(found - floor)
@@ -23,7 +24,7 @@ def test_height_steps_over_a_box_are_removed(noise_m: float) -> None:
 
 def test_heights_that_do_not_jump_stay_as_they_are() -> None:
     for noise_m in (0.0, 0.02, 0.05):
-        height = climbing(noise_m)
+        height = simulate_heights(noise_m)
         assert (remove_height_steps(TIME_S, height) == height).all()
 
 
@@ -59,7 +60,7 @@ def test_level_lasts_at_most_30_s(lasts: int, level: bool) -> None:
     values[100 : 100 + lasts] = 1.0
     assert step_offsets(values, 0.1, 0.45, 3).any() == level
     late = np.zeros(800)
-    late[800 - lasts :] = 1.0  # and has not come back when the signal ends
+    late[800 - lasts :] = 1.0  # this level lasts to the end of the signal
     assert step_offsets(late, 0.1, 0.45, 3).any() == level
 
 
@@ -96,7 +97,8 @@ def test_few_samples_are_left_as_they_are() -> None:
     assert remove_height_steps(TIME_S[:2], np.ones(2)).tolist() == [1, 1]
 
 
-def steps(*changes: tuple[int, float]) -> np.ndarray:
+def build_steps(*changes: tuple[int, float]) -> np.ndarray:
+    """Return 600 values with jumps (index, size)."""
     values = np.zeros(600)
     for at, change in changes:
         values[at:] += change
@@ -105,16 +107,16 @@ def steps(*changes: tuple[int, float]) -> np.ndarray:
 
 def test_nested_and_overlapping_steps_are_found() -> None:
     for values in (
-        steps((100, 0.7), (120, 0.5), (150, -0.5), (180, -0.7)),
-        steps((100, 0.7), (120, 0.7), (150, -0.7), (180, -0.7)),
-        steps((100, 0.7), (120, 0.6), (150, -1.3)),
+        build_steps((100, 0.7), (120, 0.5), (150, -0.5), (180, -0.7)),
+        build_steps((100, 0.7), (120, 0.7), (150, -0.7), (180, -0.7)),
+        build_steps((100, 0.7), (120, 0.6), (150, -1.3)),
     ):
         assert step_offsets(values, 0.1, 0.45, 3) == pytest.approx(values)
 
 
 def test_missed_return_does_not_spoil_the_next_step() -> None:
-    values = steps((100, 1.0), (300, 0.8), (340, -0.8))
-    ramp = np.interp(np.arange(600), [130, 160], [0.0, -1.0])  # too slow for a jump
+    values = build_steps((100, 1.0), (300, 0.8), (340, -0.8))
+    ramp = np.interp(np.arange(600), [130, 160], [0.0, -1.0])  # too slow to be a jump
     found = step_offsets(values + ramp, 0.1, 0.45, 3)
     assert found[310] == pytest.approx(0.8)
     assert not found[360:].any()

@@ -25,7 +25,7 @@ def test_robust_line_fit_has_consistent_stds() -> None:
         y[rng.random(len(x)) < 0.03] += 0.2
         slope, middle, (slope_std, middle_std) = _fit_line(x, y)
         off.append(((slope - 3e-4) / slope_std, (middle - 0.05) / middle_std))
-    # The line's own: sigma / sqrt(n), and that over the spread of x.
+    # Theory: sigma / sqrt(n) for the middle, and that over the standard deviation of x.
     assert middle_std == pytest.approx(0.02 / np.sqrt(len(x)), rel=0.4)
     assert middle_std / slope_std == pytest.approx(x.std(), rel=0.05)
     assert np.sqrt(np.mean(np.square(off), axis=0)[0]) == pytest.approx(1.0, abs=0.4)
@@ -36,7 +36,7 @@ def test_exchanges_are_matched_by_range_and_time() -> None:
     time_s = np.arange(0, 10, 0.1)
     value = 1 + 0.01 * np.arange(100)
     late = time_s + 0.05
-    late[[3, 40]] += [2 * MAX_TIME_DIFFERENCE_S, 0.2]  # out of reach, and beside the others
+    late[[3, 40]] += [2 * MAX_TIME_DIFFERENCE_S, 0.2]  # too late, and unlike the other delays
     seen = value.copy()
     seen[[7, 8]] += [1.5 * MAX_RANGE_DIFFERENCE_M, 0.5 * MAX_RANGE_DIFFERENCE_M]
     found, apart_s = _match_exchanges(late, seen, time_s, value)
@@ -44,7 +44,7 @@ def test_exchanges_are_matched_by_range_and_time() -> None:
     assert apart_s == pytest.approx(np.full(97, 0.05))
 
 
-def test_a_clock_s_deviations_are_of_its_offset_and_of_its_drift() -> None:
+def test_clock_from_exchanges_has_stds_of_offset_and_drift() -> None:
     rng = np.random.default_rng(5)
     time_s = np.arange(0, 200, 0.05)
     range_m = np.round(3 + np.sin(time_s / 3) + np.sin(time_s / 1.7 + 1), 3)
@@ -62,7 +62,7 @@ def test_a_clock_s_deviations_are_of_its_offset_and_of_its_drift() -> None:
 def test_matched_exchanges_refine_a_coarse_clock(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """A guess that is 50 ms late and 100 ppm slow, of a clock that is right."""
+    """The coarse estimate is 50 ms and 100 ppm off; the true clock has no error."""
     time_s = np.arange(0, 100, 0.05)
     range_m = 3 + np.sin(time_s / 3) + 0.01 * np.arange(len(time_s)) % 0.5
     monkeypatch.setattr(ranging_clocks, "estimate_clock", lambda *_: Clock(0.05, -1e-4, at_s=40.0))

@@ -11,12 +11,12 @@ from dmrl.estimation.signals.sensor_tracks import (
 GRID_S = np.arange(0, 20, 0.01)
 
 
-def noisy() -> np.ndarray:
+def draw_noise() -> np.ndarray:
     return np.random.default_rng(0).normal(0, 0.1, (len(GRID_S), 2))
 
 
-def test_a_spike_is_rare_in_its_log() -> None:
-    turn = 0.5 * np.sin(2 * GRID_S) + noisy()[:, 0] / 5
+def test_only_rare_outliers_are_spikes() -> None:
+    turn = 0.5 * np.sin(2 * GRID_S) + draw_noise()[:, 0] / 5
     turn[700] += 3.0
     assert np.flatnonzero(find_spikes(turn)).tolist() == [700]
     assert find_spikes(np.degrees(turn)).sum() < 3
@@ -24,7 +24,7 @@ def test_a_spike_is_rare_in_its_log() -> None:
 
 
 def test_zero_optical_flow_is_a_dropout() -> None:
-    velocity = noisy()
+    velocity = draw_noise()
     stuck = (GRID_S > 5) & (GRID_S < 9)
     velocity[stuck] = 0.0
     height = np.ones((len(GRID_S), 1))
@@ -33,13 +33,13 @@ def test_zero_optical_flow_is_a_dropout() -> None:
 
 
 def test_upsampled_and_constant_zero_logs_are_not_frozen() -> None:
-    slow = np.repeat(noisy()[::20], 20, axis=0)
+    slow = np.repeat(draw_noise()[::20], 20, axis=0)
     assert not find_frozen(GRID_S, slow, GRID_S).any()
     assert not find_frozen(GRID_S, np.zeros((len(GRID_S), 2)), GRID_S).any()
 
 
 def test_track_columns_match_sensors_and_dropouts_are_marked() -> None:
-    forward = noisy() * 0.01 + [1.0, -0.5]
+    forward = draw_noise() * 0.01 + [1.0, -0.5]
     turn = np.full((len(GRID_S), 1), 0.3)
     high = np.ones((len(GRID_S), 1))
     every = (GRID_S, turn), (GRID_S, forward), (GRID_S, high)
@@ -58,7 +58,7 @@ def test_track_columns_match_sensors_and_dropouts_are_marked() -> None:
 
 @pytest.mark.parametrize(("lasts_s", "stuck"), [(0.49, False), (0.52, True)])
 def test_silence_is_longer_than_half_a_second(lasts_s: float, stuck: bool) -> None:
-    values = noisy()
+    values = draw_noise()
     values[500 : 500 + round(100 * lasts_s) + 1] = values[500]
     found = find_frozen(GRID_S, values, GRID_S)
     assert found.any() == stuck
@@ -68,7 +68,7 @@ def test_silence_is_longer_than_half_a_second(lasts_s: float, stuck: bool) -> No
 
 @pytest.mark.parametrize(("share", "told"), [(0.48, True), (0.52, False)])
 def test_signal_with_mostly_repeated_samples_is_not_frozen(share: float, told: bool) -> None:
-    values = noisy()
+    values = draw_noise()
     values[: round(share * len(values))] = 1.0
     assert find_frozen(GRID_S, values, GRID_S).any() == told
 
@@ -76,7 +76,7 @@ def test_signal_with_mostly_repeated_samples_is_not_frozen(share: float, told: b
 def test_heights_are_smoothed_by_local_parabolas() -> None:
     high = 1 + 0.3 * GRID_S - 0.02 * GRID_S**2
     still = np.zeros((len(GRID_S), 1))
-    logs = (GRID_S, still), (GRID_S, noisy())
+    logs = (GRID_S, still), (GRID_S, draw_noise())
     inner = slice(30, -30)
     found = build_track(*logs, (GRID_S, high[:, None]), GRID_S).height_m
     assert found[inner] == pytest.approx(high[inner])
@@ -107,9 +107,11 @@ def test_rounded_signals_and_short_logs_do_not_show_saturation() -> None:
 
 def test_heights_at_1_hz_are_no_dropout() -> None:
     second = GRID_S[::100]
-    turn = noisy()[:, :1]
-    found = build_track((GRID_S, turn), (GRID_S, noisy()), (second, np.ones((20, 1))), GRID_S)
+    turn = draw_noise()[:, :1]
+    found = build_track((GRID_S, turn), (GRID_S, draw_noise()), (second, np.ones((20, 1))), GRID_S)
     assert found.height_dropout is not None and not found.height_dropout[:1800].any()
     gone = second != 9.0
-    found = build_track((GRID_S, turn), (GRID_S, noisy()), (second[gone], np.ones((19, 1))), GRID_S)
+    found = build_track(
+        (GRID_S, turn), (GRID_S, draw_noise()), (second[gone], np.ones((19, 1))), GRID_S
+    )
     assert found.height_dropout is not None and found.height_dropout[850:950].all()

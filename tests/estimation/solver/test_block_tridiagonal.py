@@ -1,4 +1,4 @@
-"""Normal equations against dense ones."""
+"""Block tridiagonal normal equations, compared with dense ones."""
 
 from dataclasses import replace
 
@@ -16,8 +16,8 @@ from dmrl.estimation.solver.block_tridiagonal import (
 KEYS, WIDTH, GLOBALS = 5, 3, 2
 
 
-def random_equations(seed: int = 0) -> tuple[NormalEquations, Array, Array]:
-    """Equations of random rows, and the dense matrix and vector of the same rows."""
+def draw_equations(seed: int = 0) -> tuple[NormalEquations, Array, Array]:
+    """Return equations of random rows, and their dense matrix and vector."""
     rng = np.random.default_rng(seed)
     out = NormalEquations.zeros(KEYS, WIDTH, GLOBALS)
     size = KEYS * WIDTH + GLOBALS
@@ -43,7 +43,7 @@ def random_equations(seed: int = 0) -> tuple[NormalEquations, Array, Array]:
 
 
 def test_normal_equations_equal_dense_jtj() -> None:
-    found, dense, vector = random_equations()
+    found, dense, vector = draw_equations()
     for key in range(KEYS):
         mine = slice(key * WIDTH, (key + 1) * WIDTH)
         assert found.diagonal[key] == pytest.approx(dense[mine, mine])
@@ -58,7 +58,7 @@ def test_normal_equations_equal_dense_jtj() -> None:
 
 
 def test_step_equals_dense_solve() -> None:
-    found, dense, vector = random_equations()
+    found, dense, vector = draw_equations()
     step = solve_step(found)
     wanted = -np.linalg.solve(dense, vector)
     assert np.append(step.state.ravel(), step.constants) == pytest.approx(wanted)
@@ -73,7 +73,7 @@ def test_step_equals_dense_solve() -> None:
 
 
 def test_damping_applies_to_keyframes_only() -> None:
-    found, *_ = random_equations()
+    found, *_ = draw_equations()
     damped = found.damped(3.0)
     assert damped.diagonal[2].diagonal() == pytest.approx(4 * found.diagonal[2].diagonal())
     assert damped.diagonal[2, 0, 1] == found.diagonal[2, 0, 1]
@@ -82,13 +82,13 @@ def test_damping_applies_to_keyframes_only() -> None:
 
 
 def test_a_matrix_that_is_not_positive_definite_is_an_error() -> None:
-    found, *_ = random_equations()
+    found, *_ = draw_equations()
     with pytest.raises(np.linalg.LinAlgError):
         solve_step(replace(found, diagonal=-found.diagonal))
 
 
 def test_eliminated_keyframes_leave_the_schur_complement() -> None:
-    found, dense, vector = random_equations()
+    found, dense, vector = draw_equations()
     information, pull = eliminate_before(found, 3)
     gone = np.arange(3 * WIDTH)
     kept = np.concatenate([np.arange(3 * WIDTH, 4 * WIDTH), np.arange(GLOBALS) + KEYS * WIDTH])

@@ -12,32 +12,37 @@ from dmrl.estimation.solver.keyframes import build_problem
 from dmrl.estimation.solver.levenberg_marquardt import MapEstimate, Solver
 from dmrl.estimation.solver.residuals import bearing_factor
 
-from ..flights import flown, pair_of
-from ..sighted_flights import NOISE, sightings
+from ..flights import build_pair, simulate_flight
+from ..sighted_flights import NOISE, simulate_bearings
 
 pytestmark = pytest.mark.heavy
 
 
 def solve_sighted(sees: BearingMeasurements) -> tuple[Solver, MapEstimate]:
-    """The plain solution of a flight of 60 s with the detections of the first robot."""
-    pair = replace(pair_of(flown("in_view", "calibrated", 1000, 60.0)), own_bearings=sees)
+    """Solve a flight of 60 s with detections of the first robot, without error models."""
+    pair = replace(
+        build_pair(simulate_flight("in_view", "calibrated", 1000, 60.0)), own_bearings=sees
+    )
     member = solve_pair(build_problem({(0, 1): pair}), plain=True).mixture.members[0]
     views = build_problem({(0, 1): pair}).views
     return replace(member.solver, problem=replace(member.solver.problem, views=views)), member.found
 
 
-def see(hz: float = 10.0) -> BearingMeasurements:
-    return sightings(flown("in_view", "calibrated", 1000, 60.0), "cf1", ("cf2",), hz=hz)
+def simulate_images(hz: float = 10.0) -> BearingMeasurements:
+    """Return detections of cf2 in the images of cf1."""
+    return simulate_bearings(
+        simulate_flight("in_view", "calibrated", 1000, 60.0), "cf1", ("cf2",), hz=hz
+    )
 
 
 @cache
 def solve_seen() -> tuple[Solver, MapEstimate]:
-    return solve_sighted(see())
+    return solve_sighted(simulate_images())
 
 
 @pytest.mark.parametrize("assumed", [1.0, 2.5])
 def test_noise_of_detections_is_that_of_their_residuals(assumed: float) -> None:
-    sees = see()
+    sees = simulate_images()
     solver, found = solve_sighted(replace(sees, std=sees.std * assumed))
     (view,) = calibrate_views(solver, found)[0].problem.views
     ratio = view.std[0, 0] / NOISE
@@ -45,8 +50,8 @@ def test_noise_of_detections_is_that_of_their_residuals(assumed: float) -> None:
     assert (view.weight == 1).all()
 
 
-def test_errors_that_last_count_once() -> None:
-    sees, rng = see(), np.random.default_rng(4)
+def test_correlated_errors_count_once() -> None:
+    sees, rng = simulate_images(), np.random.default_rng(4)
     lasting = np.zeros(len(sees.time_s))
     for k in range(1, len(lasting)):
         lasting[k] = 0.95 * lasting[k - 1] + 0.06 * rng.standard_normal()
@@ -64,7 +69,7 @@ def test_errors_that_last_count_once() -> None:
 
 
 def test_few_images_keep_their_noise() -> None:
-    sees = see(hz=0.5)
+    sees = simulate_images(hz=0.5)
     assert len(sees.time_s) < MIN_IMAGES
     solver, found = solve_sighted(sees)
     assert calibrate_views(solver, found) == (solver, found)
@@ -81,7 +86,10 @@ def test_independent_residuals_are_not_repeated() -> None:
 
 
 def test_leverage_is_that_of_the_whole_matrix() -> None:
-    pair = replace(pair_of(flown("in_view", "calibrated", 1000, 20.0)), own_bearings=see())
+    pair = replace(
+        build_pair(simulate_flight("in_view", "calibrated", 1000, 20.0)),
+        own_bearings=simulate_images(),
+    )
     solver = Solver(build_problem({(0, 1): pair}))
     values = solve_pair(solver.problem, plain=True).values
     equations = solver.equations(values)[0]
@@ -110,7 +118,7 @@ def test_leverage_is_that_of_the_whole_matrix() -> None:
         assert found[k, 0] == pytest.approx(expected, rel=1e-4, abs=1e-9)
 
 
-def test_noise_is_the_residuals_over_the_share_that_is_open(
+def test_noise_is_larger_than_residuals_by_their_leverage(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     solver, found = solve_seen()

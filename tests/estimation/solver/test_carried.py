@@ -1,4 +1,4 @@
-"""Information that a window takes from the one before it, under any error model."""
+"""Information that a window takes over from the previous one, also with other unknowns."""
 
 from dataclasses import replace
 
@@ -11,11 +11,11 @@ from dmrl.estimation.solver.priors import Carried
 from dmrl.estimation.solver.robust_loss import Cauchy, Gaussian, Loss
 from dmrl.estimation.solver.unknowns import Unknown, turn
 
-from .test_residuals import flight
+from .test_residuals import build_flight
 
 
-def carry(solver: Solver) -> Carried:
-    """Return definite information about a solver's unknowns."""
+def build_carried(solver: Solver) -> Carried:
+    """Return random positive definite information about the unknowns of a solver."""
     layout = solver.layout
     size = layout.width + len(layout.constants)
     roots = np.random.default_rng(3).normal(size=(size, size))
@@ -23,7 +23,7 @@ def carry(solver: Solver) -> Carried:
 
 
 def test_carried_information_is_least_at_its_optimum() -> None:
-    carried = carry(Solver(flight()[0]))
+    carried = build_carried(Solver(build_flight()[0]))
     best = carried.mean - np.linalg.solve(carried.information, carried.vector)
     off = best.copy()
     off[-1] += 0.2
@@ -34,7 +34,7 @@ def test_carried_information_is_least_at_its_optimum() -> None:
 
 @pytest.mark.parametrize("loss", [Gaussian(), Cauchy(3.0)])
 def test_carried_information_adds_the_gradient_of_its_cost(loss: Loss) -> None:
-    carried = carry(Solver(flight()[0]))
+    carried = build_carried(Solver(build_flight()[0]))
     width, size = carried.layout.width, len(carried.mean)
     value, step = carried.mean + 0.1 * np.random.default_rng(4).normal(size=size), 1e-5
     equations = NormalEquations.zeros(2, width, size - width)
@@ -50,7 +50,7 @@ def test_carried_information_adds_the_gradient_of_its_cost(loss: Loss) -> None:
 
 
 def test_carried_heading_may_differ_by_whole_turns() -> None:
-    carried = carry(Solver(flight()[0]))
+    carried = build_carried(Solver(build_flight()[0]))
     turned = carried.mean.copy()
     turned[[2, 5]] += 2 * np.pi * np.array([1, -4])
     costs = [carried.to_factor(value, Gaussian()).cost() for value in (carried.mean, turned)]
@@ -58,9 +58,9 @@ def test_carried_heading_may_differ_by_whole_turns() -> None:
 
 
 def test_carried_information_is_of_the_unknowns_that_both_layouts_have() -> None:
-    """Those that one lacks are marginalized; nothing is known of those that it alone has."""
-    problem, _ = flight()
-    carried = carry(Solver(problem))
+    """Unknowns that are dropped are marginalized; new unknowns have no information."""
+    problem, _ = build_flight()
+    carried = build_carried(Solver(problem))
     free = Unknown("scale_free", "1", 0.1, "robot", motion=turn)
     more = replace(problem, table=(*problem.table, free)).layout
     fewer = replace(problem, table=problem.table[:-1]).layout
@@ -79,9 +79,9 @@ def test_carried_information_is_of_the_unknowns_that_both_layouts_have() -> None
 
 
 def test_evidence_is_finite_after_an_earlier_window() -> None:
-    """The first values of walks are then known: their broad prior is no part of the evidence."""
-    problem, values = flight()
+    """The carried information then replaces the broad prior on first values of random walks."""
+    problem, values = build_flight()
     solver = Solver(problem)
     found = MapEstimate(values, 0.0)
-    later = replace(solver, carried=carry(solver))
+    later = replace(solver, carried=build_carried(solver))
     assert np.isfinite([solver.log_evidence(found), later.log_evidence(found)]).all()

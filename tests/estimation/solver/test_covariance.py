@@ -1,4 +1,4 @@
-"""Covariances that count motion but no noise."""
+"""Covariances of positions, for which noise is removed from the estimated motion."""
 
 from dataclasses import replace
 
@@ -18,17 +18,17 @@ from dmrl.estimation.solver.keyframes import build_problem
 from dmrl.estimation.solver.levenberg_marquardt import Solver, relative_path
 from dmrl.estimation.solver.problem import NoiseModel, Problem
 
-from ..sighted_flights import still_pair
-from .test_residuals import flight
+from ..sighted_flights import build_still_pair
+from .test_residuals import build_flight
 
 KEYS, STEP_S = 501, 0.2
 KEY_S = np.arange(KEYS) * STEP_S
 
 
-def problem(noise: NoiseModel | None = None) -> Problem:
-    """A flight of two robots of 100 s; its measurements do not matter."""
+def build_still_problem(noise: NoiseModel | None = None) -> Problem:
+    """Return the problem of two robots at rest for 100 s; its measurements do not matter."""
     time_s = np.arange(0, 100.001, 0.01)
-    short, _ = still_pair()
+    short, _ = build_still_pair()
     zero, never = np.zeros(len(time_s)), np.zeros(len(time_s), bool)
     still = replace(
         short.own, vx_mps=zero, vy_mps=zero, yaw_rate_radps=zero, height_m=zero, dropout=never
@@ -38,8 +38,8 @@ def problem(noise: NoiseModel | None = None) -> Problem:
     return replace(build_problem({(0, 1): pair}), noise=noise or NoiseModel())
 
 
-def moving(task: Problem, *velocities: np.ndarray | complex) -> np.ndarray:
-    """States of robots at complex velocities, (S,) or constant."""
+def build_states(task: Problem, *velocities: np.ndarray | complex) -> np.ndarray:
+    """Return states of robots with complex velocities vx + i vy, (S,) or constant, m/s."""
     state = np.zeros((KEYS, task.layout.width))
     for robot, velocity in enumerate(velocities):
         steps = np.broadcast_to(velocity, KEYS - 1) * STEP_S
@@ -48,8 +48,8 @@ def moving(task: Problem, *velocities: np.ndarray | complex) -> np.ndarray:
     return state
 
 
-def speeds(task: Problem, state: np.ndarray) -> list[float]:
-    """Root mean square of the calm own and relative velocity."""
+def measure_speeds(task: Problem, state: np.ndarray) -> list[float]:
+    """Return the RMS of the denoised own velocity and of the relative velocity, m/s."""
     calm = calm_motion(task, state)
     own, peer = (calm[:, 3 * k] + 1j * calm[:, 3 * k + 1] for k in (0, 1))
     inner = slice(50, -50)
@@ -59,8 +59,8 @@ def speeds(task: Problem, state: np.ndarray) -> list[float]:
     ]
 
 
-def noise_of(task: Problem, rng: np.random.Generator) -> np.ndarray:
-    """Odometry noise of the model: a part that fades in 0.3 s, and a white one."""
+def draw_odometry_noise(task: Problem, rng: np.random.Generator) -> np.ndarray:
+    """Draw velocity noise of the model, a correlated part with 0.3 s and a white one, m/s."""
     fading = 0.08 * task.noise.grade
     out, value = np.zeros(KEYS - 1, complex), 0j
     for k in range(10 * (KEYS - 1)):
@@ -74,37 +74,49 @@ def noise_of(task: Problem, rng: np.random.Generator) -> np.ndarray:
 
 @pytest.mark.heavy
 def test_denoising_removes_motion_that_is_noise() -> None:
-    task, rng = problem(), np.random.default_rng(0)
+    task, rng = build_still_problem(), np.random.default_rng(0)
     for _ in range(3):
-        own, relative = speeds(task, moving(task, noise_of(task, rng), noise_of(task, rng)))
+        own, relative = measure_speeds(
+            task, build_states(task, draw_odometry_noise(task, rng), draw_odometry_noise(task, rng))
+        )
         raw = np.sqrt(2 * task.velocity_psd / STEP_S)
         assert own < 0.15 * raw and relative < 0.15 * raw
 
 
 @pytest.mark.heavy
 def test_denoising_keeps_fast_and_slow_motion() -> None:
-    task = problem(NoiseModel(grade=0.63))
+    task = build_still_problem(NoiseModel(grade=0.63))
     rng = np.random.default_rng(1)
     for speed, period_s in ((0.5, 6.0), (0.12, 25.0)):
         way = speed * np.exp(2j * np.pi * KEY_S[1:] / period_s)
-        own, relative = speeds(task, moving(task, way + noise_of(task, rng), noise_of(task, rng)))
+        own, relative = measure_speeds(
+            task,
+            build_states(
+                task, way + draw_odometry_noise(task, rng), draw_odometry_noise(task, rng)
+            ),
+        )
         assert 0.5 * speed < own < 1.2 * speed
         assert 0.5 * speed < relative < 1.2 * speed
 
 
 def test_equal_motions_have_no_relative_motion() -> None:
-    task, rng = problem(), np.random.default_rng(2)
+    task, rng = build_still_problem(), np.random.default_rng(2)
     way = 0.5 * np.exp(2j * np.pi * KEY_S[1:] / 6.0)
-    own, relative = speeds(task, moving(task, way + noise_of(task, rng), way + noise_of(task, rng)))
+    own, relative = measure_speeds(
+        task,
+        build_states(
+            task, way + draw_odometry_noise(task, rng), way + draw_odometry_noise(task, rng)
+        ),
+    )
     assert own == pytest.approx(0.5, rel=0.2)
     assert relative < 0.1
 
 
 def test_a_constant_velocity_within_the_bias_is_no_motion() -> None:
-    task = problem(NoiseModel(grade=0.3))
-    own, _ = speeds(task, moving(task, 0.02 + 0j, 0j))
+    task = build_still_problem(NoiseModel(grade=0.3))
+    own, _ = measure_speeds(task, build_states(task, 0.02 + 0j, 0j))
     assert own < 0.005
-    own, _ = speeds(task, moving(task, 0.2 + 0j, 0j))
+    own, _ = measure_speeds(task, build_states(task, 0.2 + 0j, 0j))
     assert own == pytest.approx(0.2, rel=0.2)
 
 
@@ -119,7 +131,7 @@ def test_relative_covariance_matches_samples() -> None:
         assert found == pytest.approx(np.cov(relative_path(drawn, *both).T), rel=0.05, abs=2e-6)
 
 
-def test_relative_covariance_keeps_its_sides_to_the_peer() -> None:
+def test_relative_covariance_turns_with_the_direction_to_the_peer() -> None:
     calm = np.array([[0.0, 0.0, 0.3, 2.0, 0.0, 0.0]])
     state = np.array([[0.0, 0.0, 0.3, 0.0, 2.5, 0.0]])
     spread = np.diag([0.0, 0.0, 0.01, 0.04, 0.25, 0.0])[None]
@@ -136,7 +148,7 @@ def test_covariance_without_motion_noise_is_the_inverse_normal_matrix(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(covariance, "calm_motion", lambda _problem, state: state)
-    task, values = flight()
+    task, values = build_flight()
     quiet = replace(task, noise=replace(task.noise, grade=1e-3), views=())
     width = quiet.layout.width
     values = type(values)(values.state[:, :width], np.zeros(len(quiet.layout.constants)))

@@ -1,4 +1,4 @@
-"""Estimates between keyframes, and seen from the other robot."""
+"""Interpolation of estimates between keyframes, and their transform to the other robot."""
 
 from dataclasses import fields, replace
 
@@ -19,8 +19,8 @@ from dmrl.estimation.solver.problem import NoiseModel
 COUNT = 4
 
 
-def estimate(seed: int = 0) -> Estimate:
-    """Anything, at 3, 3.5, 4 and 4.5 s."""
+def draw_estimate(seed: int = 0) -> Estimate:
+    """Draw a random estimate at 3, 3.5, 4 and 4.5 s."""
     rng = np.random.default_rng(seed)
     root = rng.normal(size=(COUNT, 3, 3))
     return Estimate(
@@ -35,7 +35,7 @@ def estimate(seed: int = 0) -> Estimate:
 
 @given(st.floats(3, 4.5))
 def test_estimate_is_interpolated_linearly_between_keyframes(time_s: float) -> None:
-    found = estimate()
+    found = draw_estimate()
     xy, spread, status = found.interpolate_at(np.array([time_s]))
     for got, columns in ((xy, found.state[:, :2]), (spread, found.covariance[:, :2, :2])):
         flat = columns.reshape(COUNT, -1).T
@@ -45,7 +45,7 @@ def test_estimate_is_interpolated_linearly_between_keyframes(time_s: float) -> N
 
 
 def test_estimate_is_held_and_unconverged_outside_the_flight() -> None:
-    found = replace(estimate(), status=np.array([OK, OK, AMBIGUOUS, AMBIGUOUS], np.int8))
+    found = replace(draw_estimate(), status=np.array([OK, OK, AMBIGUOUS, AMBIGUOUS], np.int8))
     xy, _, status = found.interpolate_at(np.array([2.99, 3.0, 3.49, 3.51, 4.5, 4.51]))
     assert status.tolist() == [UNCONVERGED, OK, OK, AMBIGUOUS, AMBIGUOUS, AMBIGUOUS]
     assert xy[[0, 1, 4, 5]] == pytest.approx(found.state[[0, 0, -1, -1], :2])
@@ -63,7 +63,7 @@ def test_transform_to_peer_inverts_the_relative_pose() -> None:
 
 
 def test_covariance_seen_from_peer_is_transformed_by_the_jacobian() -> None:
-    found = estimate(2)
+    found = draw_estimate(2)
     other = seen_from_peer(found)
     assert other.state == pytest.approx(transform_to_peer(found.state))
     step = 1e-6
@@ -83,7 +83,7 @@ def test_covariance_seen_from_peer_is_transformed_by_the_jacobian() -> None:
 
 
 def test_seen_from_peer_swaps_constants() -> None:
-    found = estimate(3)
+    found = draw_estimate(3)
     other = seen_from_peer(found)
     for name in ("gyro_bias", "velocity_scale", "vx_bias", "vy_bias", "height_offset"):
         for side in (0, 1):

@@ -1,4 +1,4 @@
-"""Solves of whole flights, and the evidence of a model."""
+"""Levenberg-Marquardt solves, and the Laplace evidence of a model."""
 
 from dataclasses import replace
 
@@ -24,13 +24,13 @@ from dmrl.estimation.solver.problem import NoiseModel
 from dmrl.estimation.solver.residuals import Factor, Values
 from dmrl.estimation.solver.unknowns import TABLE, without_rows
 
-from ..flights import flown, pair_of
-from .test_residuals import flight, moved
+from ..flights import build_pair, simulate_flight
+from .test_residuals import build_flight, perturb
 
 
 def test_solve_converges_to_the_true_flight() -> None:
-    problem, true = flight()
-    start = moved(true, 3)
+    problem, true = build_flight()
+    start = perturb(true, 3)
     found = Solver(problem).solve(start)
     error = relative_path(found.values.state) - relative_path(true.state)
     assert np.abs(error[:, :2]).max() < 0.01 < np.abs(start.state - true.state).max()
@@ -39,7 +39,7 @@ def test_solve_converges_to_the_true_flight() -> None:
 
 
 def test_a_step_that_turns_all_robots_keeps_what_they_measure() -> None:
-    _, true = flight()
+    _, true = build_flight()
     turn = np.linspace(0.0, 1.5, len(true.state))
     place = true.state[:, 0:6:3] + 1j * true.state[:, 1:6:3]
     path = np.cumsum(1j * turn[:-1] * np.diff(place[:, 0]))
@@ -51,7 +51,7 @@ def test_a_step_that_turns_all_robots_keeps_what_they_measure() -> None:
     np.testing.assert_allclose(relative_path(turned.state), relative_path(true.state), atol=1e-9)
     way = np.abs(np.diff(turned.state[:, 0:6:3] + 1j * turned.state[:, 1:6:3], axis=0))
     assert way[:, 0] == pytest.approx(np.abs(np.diff(place[:, 0])))
-    # A small step is the sum.
+    # A small step is simply added.
     near = apply_step(true, 1e-5 * step, np.ones_like(true.constants), 2)
     np.testing.assert_allclose(near.state, true.state + 1e-5 * step, atol=1e-8)
     assert (near.constants == true.constants + 1).all()
@@ -61,8 +61,8 @@ def test_a_step_that_turns_all_robots_keeps_what_they_measure() -> None:
 def test_a_small_gain_of_a_damped_step_does_not_end_the_iteration(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """From a peer that faces away the first steps fail, and the next ones are damped."""
-    flown_pair = pair_of(flown("random", "realistic", 1004, 20.0))
+    """The start has a wrong heading of the peer, so the first steps fail and damping rises."""
+    flown_pair = build_pair(simulate_flight("random", "realistic", 1004, 20.0))
     problem = coarsen(build_problem({(0, 1): flown_pair}))
     pose = np.tile([1.5, 0.0, 0.0], (len(problem.keyframe_s), 1))
     start, used = place_peer(problem, pose, np.zeros(2)), []
@@ -79,7 +79,7 @@ def test_a_small_gain_of_a_damped_step_does_not_end_the_iteration(
 
 
 def test_a_singular_step_is_damped_until_it_can_be_solved(monkeypatch: pytest.MonkeyPatch) -> None:
-    problem, true = flight()
+    problem, true = build_flight()
     build, singular = levenberg_marquardt.build_equations, []
 
     def build_indefinite_first(
@@ -92,7 +92,7 @@ def test_a_singular_step_is_damped_until_it_can_be_solved(monkeypatch: pytest.Mo
         return equations
 
     monkeypatch.setattr(levenberg_marquardt, "build_equations", build_indefinite_first)
-    found = Solver(problem).solve(moved(true, 3))
+    found = Solver(problem).solve(perturb(true, 3))
     error = relative_path(found.values.state) - relative_path(true.state)
     assert np.abs(error[:, :2]).max() < 0.01
     with pytest.raises(np.linalg.LinAlgError):
@@ -101,15 +101,15 @@ def test_a_singular_step_is_damped_until_it_can_be_solved(monkeypatch: pytest.Mo
 
 @pytest.mark.heavy
 def test_an_iteration_ends_at_a_known_solution() -> None:
-    problem, true = flight()
-    whole = Solver(problem).solve(moved(true, 3), tolerance=0.0)
-    early = Solver(problem).solve(moved(true, 3), [whole], tolerance=0.0, same_m=0.02)
+    problem, true = build_flight()
+    whole = Solver(problem).solve(perturb(true, 3), tolerance=0.0)
+    early = Solver(problem).solve(perturb(true, 3), [whole], tolerance=0.0, same_m=0.02)
     assert early.cost >= whole.cost
     assert is_same_solution(early.values, whole.values, 0.02)
 
 
 def test_solutions_are_equal_if_their_relative_paths_are() -> None:
-    _, true = flight()
+    _, true = build_flight()
     state = true.state.copy()
     state[7, 3] += 0.06
     other = Values(state, true.constants)
@@ -129,8 +129,8 @@ def test_a_relative_path_is_the_peer_in_the_observer_s_frame() -> None:
 
 @pytest.mark.heavy
 def test_log_evidence_equals_laplace_approximation_by_quadrature() -> None:
-    """Of a model with fewer unknowns it is the integral over those, by quadrature."""
-    problem, true = flight()
+    """The range offset is integrated numerically and compared with its Laplace approximation."""
+    problem, true = build_flight()
     rows = without_rows(TABLE, ("velocity_error_x", "velocity_error_y", "range_error"))
     small = replace(problem, table=rows, views=())
     start = Values(true.state[:, :6], np.zeros(len(small.layout.constants)))
@@ -139,7 +139,7 @@ def test_log_evidence_equals_laplace_approximation_by_quadrature() -> None:
     grid = np.linspace(-0.4, 0.4, 33)
     logs = []
     for value in grid:
-        # A known offset is taken from the ranges, and its prior density is counted by hand.
+        # The offset is subtracted from the ranges, and its prior density is added by hand.
         (link,) = small.links
         shifted = replace(link, range_m=link.range_m - value)
         rest = without_rows(rows, ("range_offset",))
@@ -150,14 +150,14 @@ def test_log_evidence_equals_laplace_approximation_by_quadrature() -> None:
         prior = float(row.loss.cost(np.array((value / row.std) ** 2))) / 2
         logs.append(held.log_evidence(found) - prior - np.log(row.std))
     total = np.log(np.sum(np.exp(np.array(logs) - max(logs))) * (grid[1] - grid[0])) + max(logs)
-    # Laplace's integral over a Gaussian lacks its factor of sqrt(2 pi).
+    # `log_evidence` leaves out the constant factor sqrt(2 pi) per unknown.
     laplace = Solver(small).log_evidence(free) + np.log(2 * np.pi) / 2
     assert laplace == pytest.approx(total, abs=0.3)
 
 
 @pytest.mark.heavy
 def test_evidence_prefers_the_noise_that_is_there() -> None:
-    pair = pair_of(flown("random", "calibrated", 1001, 40.0))
+    pair = build_pair(simulate_flight("random", "calibrated", 1001, 40.0))
     problem = build_problem({(0, 1): pair})
     links = tuple(average_ranges(link, problem.keyframe_s) for link in problem.links)
     start = None
@@ -174,15 +174,15 @@ def test_evidence_prefers_the_noise_that_is_there() -> None:
 
 
 def _true_values(pair: object, solver: Solver) -> Values:
-    """Values at the truth of the flight of `test_evidence_prefers_the_noise_that_is_there`."""
-    world, layout = flown("random", "calibrated", 1001, 40.0), solver.layout
+    """Return the true values of the flight of `test_evidence_prefers_the_noise_that_is_there`."""
+    world, layout = simulate_flight("random", "calibrated", 1001, 40.0), solver.layout
     key_s = solver.problem.keyframe_s
     state = np.zeros((len(key_s), layout.width))
     for robot, name in enumerate(("cf1", "cf2")):
         truth, mine = world.truth[name], layout.pose(robot)
         state[:, mine[:2]] = truth.position_at(key_s)[:, :2]
         state[:, mine[2]] = truth.yaw_at(key_s)
-    # The frame begins at the first robot.
+    # The origin of the frame is the first position of the first robot.
     state[:, [0, 3]] -= state[0, 0]
     state[:, [1, 4]] -= state[0, 1]
     assert state[0, 2] == pytest.approx(0.0, abs=0.2)

@@ -1,4 +1,4 @@
-"""A scale of a robot's motion counts for the centimetres between keyframes, too."""
+"""A scale of a robot's motion also applies between a keyframe and a measurement."""
 
 from dataclasses import replace
 
@@ -7,13 +7,13 @@ import pytest
 
 from dmrl.estimation.solver.residuals import Rows, Values, bearing_factor, range_factor
 
-from .test_residuals import flight
+from .test_residuals import build_flight
 
 
 @pytest.mark.parametrize("side", [0, 1])
 def test_measurements_between_keyframes_take_the_scale_of_the_motion(side: int) -> None:
-    """Motion that is logged 1.25 times too long, under that scale, leaves the same residuals."""
-    problem, values = flight()
+    """Motion logged 1.25 times too long, with that scale, leaves the residuals unchanged."""
+    problem, values = build_flight()
     name = ("own_shift_m", "peer_shift_m")[side]
 
     def residuals(factor: float) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Priors of chains and constants: their costs and the information that they add."""
+"""Priors of chains and constants: their costs and information."""
 
 import numpy as np
 import pytest
@@ -9,10 +9,10 @@ from dmrl.estimation.solver.priors import Chain, ConstantPrior
 from dmrl.estimation.solver.robust_loss import Cauchy, Gaussian
 from dmrl.estimation.solver.unknowns import Unknown
 
-from .test_residuals import flight
+from .test_residuals import build_flight
 
 
-def test_information_of_a_chain_is_the_square_of_its_slopes() -> None:
+def test_information_of_a_chain_is_jtj_of_its_residuals() -> None:
     row = Unknown("a", "m", 0.1, "pair", evolution="walk")
     kept, std, value = np.array([0.5, 0.9]), np.array([0.1, 0.2]), np.array([0.3, 0.2, 0.6])
     equations = NormalEquations.zeros(3, 1, 0)
@@ -31,7 +31,7 @@ def test_chain_factor_is_a_random_walk_with_start_prior() -> None:
     assert chain.residual == pytest.approx([0.75, (0.2 - 0.15) / 0.1, (0.6 - 0.18) / 0.2])
     loss = np.log1p(chain.residual**2).sum() + 0.04 * np.log1p((value / 0.05) ** 2).sum()
     assert chain.cost() == pytest.approx(loss / 2)
-    problem, values = flight()
+    problem, values = build_flight()
     begun, carried = (
         [f for f in linearize(problem, problem.layout, values, known=k) if isinstance(f, Chain)]
         for k in ((), dict(problem.layout.states))

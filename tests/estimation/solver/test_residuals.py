@@ -1,4 +1,4 @@
-"""Factors: exact Jacobians by finite differences, and zero residuals at the truth."""
+"""Factors have zero residuals at the truth, and Jacobians equal to finite differences."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -26,7 +26,8 @@ from dmrl.estimation.solver.unknowns import Unknown
 TIME_S = np.arange(0, 4.001, 0.01)
 
 
-def track(turn: float, vx: float, vy: float, height: float) -> SensorTrack:
+def build_track(turn: float, vx: float, vy: float, height: float) -> SensorTrack:
+    """Return a log of 4 s whose vx, yaw rate and height oscillate around these values."""
     ones = np.ones(len(TIME_S))
     swing = np.sin(TIME_S)
     return SensorTrack(
@@ -35,8 +36,8 @@ def track(turn: float, vx: float, vy: float, height: float) -> SensorTrack:
     )  # fmt: skip
 
 
-def paths(pair: Pair) -> tuple[Problem, Values]:
-    """A problem, and values at which both robots are on their dead reckoning."""
+def build_at_dead_reckoning(pair: Pair) -> tuple[Problem, Values]:
+    """Return the problem of a pair, and values with both robots on their dead reckoning."""
     problem = build_problem({(0, 1): pair})
     layout, key_s = problem.layout, problem.keyframe_s
     state = np.zeros((len(key_s), layout.width))
@@ -48,24 +49,24 @@ def paths(pair: Pair) -> tuple[Problem, Values]:
     return problem, Values(state, np.zeros(len(layout.constants)))
 
 
-def position(values: Values, problem: Problem, robot: int, time_s: Array) -> tuple[Array, Array]:
-    """Where a robot is and looks at any time."""
+def locate(values: Values, problem: Problem, robot: int, time_s: Array) -> tuple[Array, Array]:
+    """Return (N, 2) positions and (N,) headings of a robot at some times."""
     path, first = problem.robots[robot].path, values.state[0, 3 * robot : 3 * robot + 3]
     heading, place, _ = path.interpolate_at(time_s)
     return first[:2] + place @ rotation_matrix(first[2]).T, first[2] + heading
 
 
 @cache
-def flight() -> tuple[Problem, Values]:
-    """Two robots, exact ranges and exact detections of both cameras."""
-    own, peer = track(0.4, 0.5, -0.2, 1.0), track(-0.3, 0.1, 0.4, 1.4)
+def build_flight() -> tuple[Problem, Values]:
+    """Return the problem and true values of two robots with exact ranges and detections."""
+    own, peer = build_track(0.4, 0.5, -0.2, 1.0), build_track(-0.3, 0.1, 0.4, 1.4)
     ranges_s = np.arange(0.03, 3.99, 0.05)
     bare = Pair(TIME_S, own, peer, ranges_s, np.full(len(ranges_s), 2.0))
-    problem, values = paths(bare)
+    problem, values = build_at_dead_reckoning(bare)
     images_s = np.arange(0.13, 3.9, 0.3)
 
     def relative(time_s: Array, one: int) -> tuple[Array, Array]:
-        (here, heading), (there, _) = (position(values, problem, k, time_s) for k in (one, 1 - one))
+        (here, heading), (there, _) = (locate(values, problem, k, time_s) for k in (one, 1 - one))
         up = np.interp(time_s, TIME_S, peer.height_m - own.height_m) * (1 - 2 * one)
         return np.column_stack([rotate(rotation_matrix(-heading), there - here), up]), heading
 
@@ -82,11 +83,11 @@ def flight() -> tuple[Problem, Values]:
 
     exact = np.linalg.norm(relative(ranges_s, 0)[0], axis=1)
     pair = replace(bare, range_m=exact, own_bearings=seen(0), peer_bearings=seen(1))
-    return paths(pair)
+    return build_at_dead_reckoning(pair)
 
 
-def moved(values: Values, seed: int = 0) -> Values:
-    """Values a little off."""
+def perturb(values: Values, seed: int = 0) -> Values:
+    """Return values with random errors of 0.01."""
     rng = np.random.default_rng(seed)
     return Values(
         values.state + 0.01 * rng.standard_normal(values.state.shape),
@@ -118,7 +119,7 @@ def check_jacobian(make: Callable[[Values], Rows], values: Values) -> None:
 
 @pytest.mark.parametrize("robot", [0, 1])
 def test_odometry_factor_is_zero_at_truth_with_exact_jacobian(robot: int) -> None:
-    problem, values = flight()
+    problem, values = build_flight()
     layout = problem.layout
     rows = odometry_factor(problem, layout, robot, values)
     assert rows.rows[..., -1] == pytest.approx(0.0, abs=1e-3)
@@ -126,12 +127,12 @@ def test_odometry_factor_is_zero_at_truth_with_exact_jacobian(robot: int) -> Non
     assert names == {"gyro_bias", "velocity_scale", "vx_bias", "vy_bias"} | (
         {"clock"} if robot else set()
     )
-    check_jacobian(lambda v: odometry_factor(problem, layout, robot, v), moved(values))
+    check_jacobian(lambda v: odometry_factor(problem, layout, robot, v), perturb(values))
 
 
 def test_measured_motion_has_the_errors_of_its_sensors() -> None:
-    """A scale multiplies the true shift, a bias adds to it, and so on: signs and sizes."""
-    problem, values = flight()
+    """A scale multiplies the true motion and a bias adds to it, with the right sign and size."""
+    problem, values = build_flight()
     layout, noise, steps_s = problem.layout, problem.noise, problem.robots[0].steps_s
     for name, value, column, wanted in (
         ("velocity_scale", 0.1, 0, 0.1 * problem.robots[0].motion.shift_m[:, 0]),
@@ -151,9 +152,9 @@ def test_measured_motion_has_the_errors_of_its_sensors() -> None:
 
 
 def test_clock_derivative_shifts_odometry_in_time() -> None:
-    problem, values = flight()
+    problem, values = build_flight()
     by_clock, steps_s = problem.robots[1].clock_derivative, problem.robots[1].steps_s
-    # The turn rate is -0.3 + 0.3 sin t, so a step's turn changes by 0.3 cos t per second.
+    # The yaw rate is -0.3 + 0.3 sin t, so the turn per step changes by 0.3 cos t per second.
     expected = steps_s * 0.3 * np.cos(problem.keyframe_s[:-1] + steps_s / 2)
     assert by_clock[2:-2, 2] == pytest.approx(expected[2:-2], abs=2e-3)
     layout, constants = problem.layout, values.constants.copy()
@@ -164,12 +165,12 @@ def test_clock_derivative_shifts_odometry_in_time() -> None:
 
 
 def test_range_factor_is_zero_at_truth_with_exact_jacobian() -> None:
-    problem, values = flight()
+    problem, values = build_flight()
     layout, (link,) = problem.layout, problem.links
     rows = range_factor(problem, layout, link, values)
     assert rows.rows[..., -1] == pytest.approx(0.0, abs=2e-2)
     assert rows.weight.sum() == len(link.range_m)
-    check_jacobian(lambda v: range_factor(problem, layout, link, v), moved(values))
+    check_jacobian(lambda v: range_factor(problem, layout, link, v), perturb(values))
     std = problem.noise.range_std_m
     true_m = link.range_m.mean()
     for name, own, value, wanted in (
@@ -187,16 +188,16 @@ def test_range_factor_is_zero_at_truth_with_exact_jacobian() -> None:
 
 
 def test_range_error_that_follows_distance_has_an_exact_jacobian() -> None:
-    problem, values = flight()
+    problem, values = build_flight()
     bend = Unknown("bend", "1/m", 0.03, "pair", range_power=2)
     bent = replace(problem, table=(*problem.table, bend))
-    at = moved(Values(values.state, np.append(values.constants, -0.05)))
+    at = perturb(Values(values.state, np.append(values.constants, -0.05)))
     check_jacobian(lambda v: range_factor(bent, bent.layout, bent.links[0], v), at)
 
 
-def test_either_robot_sees_the_other_at_the_ranges_that_it_measured() -> None:
-    """The second looks back, and measured what the first did not."""
-    (link,) = flight()[0].links
+def test_sights_of_a_range_go_from_the_robot_that_measured_it() -> None:
+    """Ranges that the first robot did not measure have the bearing seen from the second."""
+    (link,) = build_flight()[0].links
     sent, far = np.linspace(0.0, 1.0, len(link.range_m)), np.ones(len(link.range_m))
     ahead, own, other = np.outer(far, [2.0, 0.0]), 0.1 * far, 0.3 * far
     sights = replace(link, sent=sent).list_sights(2 * far, ahead, own, other)
@@ -207,7 +208,7 @@ def test_either_robot_sees_the_other_at_the_ranges_that_it_measured() -> None:
 
 
 def test_ranges_at_keyframes_show_no_scale_of_the_motion_between() -> None:
-    problem, values = flight()
+    problem, values = build_flight()
     (link,), layout = problem.links, problem.layout
     scale = layout.find("velocity_scale", 1)
     assert scale in range_factor(problem, layout, link, values).border
@@ -216,7 +217,7 @@ def test_ranges_at_keyframes_show_no_scale_of_the_motion_between() -> None:
 
 
 def test_steps_are_noisy_where_the_grade_of_a_robot_is_raised() -> None:
-    problem, _ = flight()
+    problem, _ = build_flight()
     assert not problem.list_noisy_steps().any()
     steps = len(problem.keyframe_s) - 1
     raised = [np.where(np.arange(steps) == at, 2.0, 1.0) for at in (3, 5)]
@@ -226,8 +227,8 @@ def test_steps_are_noisy_where_the_grade_of_a_robot_is_raised() -> None:
 
 
 def test_a_measured_height_is_the_true_one_and_its_error() -> None:
-    """The peer is 0.4 m higher: a peer whose height reads high is nearer in height."""
-    problem, values = flight()
+    """The peer is 0.4 m higher. If its height reads too high, the true difference is smaller."""
+    problem, values = build_flight()
     layout, (link,) = problem.layout, problem.links
     means = []
     for robot in (0, 1):
@@ -240,13 +241,13 @@ def test_a_measured_height_is_the_true_one_and_its_error() -> None:
 
 @pytest.mark.parametrize("side", [0, 1])
 def test_bearing_factor_is_zero_at_truth_with_exact_jacobian(side: int) -> None:
-    problem, values = flight()
+    problem, values = build_flight()
     layout, view = problem.layout, problem.views[side]
     rows = bearing_factor(problem, layout, view, values)
     # The second candidate of every image is the peer.
     assert np.abs(rows.rows[..., -1]).max() < 0.2
     assert rows.weight.sum() == pytest.approx(len(view.time_s))
-    check_jacobian(lambda v: bearing_factor(problem, layout, view, v), moved(values))
+    check_jacobian(lambda v: bearing_factor(problem, layout, view, v), perturb(values))
     names = {layout.constants[c][0] for c in rows.border}
     assert {("camera_azimuth", (side,)), ("height_offset", (1 - side,))} < names
     assert ("camera_azimuth", (1 - side,)) not in names
@@ -259,7 +260,7 @@ def test_bearing_factor_is_zero_at_truth_with_exact_jacobian(side: int) -> None:
 
 
 def test_outlier_image_has_zero_weight_and_constant_cost() -> None:
-    problem, values = flight()
+    problem, values = build_flight()
     layout, view = problem.layout, problem.views[0]
     costs = []
     for off in (1.0, 1.2):
@@ -272,8 +273,8 @@ def test_outlier_image_has_zero_weight_and_constant_cost() -> None:
 
 @pytest.mark.parametrize(("off_rad", "is_lost"), [(0.25, False), (0.33, True)])
 def test_an_azimuth_may_be_farther_off_than_its_noise(off_rad: float, is_lost: bool) -> None:
-    """Five sigmas of 0.03 and 0.05 rad together are 0.29 rad."""
-    problem, values = flight()
+    """The limit is 0.29 rad: five times the combined noise of 0.03 and 0.05 rad."""
+    problem, values = build_flight()
     view = problem.views[0]
     off = replace(view, bearing=view.bearing + np.array([off_rad, 0.0, 0.0]))
     rows = bearing_factor(problem, problem.layout, off, values)
@@ -281,10 +282,10 @@ def test_an_azimuth_may_be_farther_off_than_its_noise(off_rad: float, is_lost: b
 
 
 def test_rows_take_the_residuals_and_weights_of_another_linearization() -> None:
-    problem, values = flight()
+    problem, values = build_flight()
     here, there = (
         range_factor(problem, problem.layout, problem.links[0], at)
-        for at in (values, moved(values, 2))
+        for at in (values, perturb(values, 2))
     )
     found = here.with_residuals_of(replace(there, weight=there.weight / 2))
     assert found.rows[..., :-1] == pytest.approx(here.rows[..., :-1])
@@ -293,10 +294,10 @@ def test_rows_take_the_residuals_and_weights_of_another_linearization() -> None:
 
 
 def test_simultaneous_images_share_one_weight() -> None:
-    problem, _ = flight()
+    problem, _ = build_flight()
     view = problem.views[0]
     assert view.weight == pytest.approx(1.0)
-    own, peer = track(0.4, 0.5, -0.2, 1.0), track(-0.3, 0.1, 0.4, 1.4)
+    own, peer = build_track(0.4, 0.5, -0.2, 1.0), build_track(-0.3, 0.1, 0.4, 1.4)
     dense_s = np.arange(0.5, 3.5, 0.06)
     sees = BearingMeasurements(
         dense_s, np.zeros((len(dense_s), 1, 3)), np.ones((len(dense_s), 1, 3))
@@ -308,9 +309,9 @@ def test_simultaneous_images_share_one_weight() -> None:
 
 @pytest.mark.heavy
 def test_equations_are_the_gradient_of_the_cost() -> None:
-    problem, values = flight()
+    problem, values = build_flight()
     solver = Solver(problem)
-    at = moved(values, 1)
+    at = perturb(values, 1)
     equations, factors = solver.equations(at)
     assert {type(factor) for factor in factors} == {Rows, Chain, ConstantPrior}
     step = 1e-6
@@ -333,7 +334,7 @@ def test_equations_are_the_gradient_of_the_cost() -> None:
 
 
 def test_odometry_noise_follows_model_and_dropouts() -> None:
-    problem, values = flight()
+    problem, values = build_flight()
     noise = NoiseModel(velocity_psd=0.01, yaw_rate_psd=0.02, grade=2.0)
     gap_s = np.full(len(problem.robots[0].steps_s), 0.1)
     own = replace(problem.robots[0], dropout_s=gap_s, turn_dropout_s=gap_s)

@@ -1,4 +1,4 @@
-"""Losses as objects: weight and curvature are derivatives of the cost."""
+"""Robust losses: weight and curvature are derivatives of the cost."""
 
 from dataclasses import dataclass, replace
 
@@ -10,12 +10,12 @@ from dmrl.estimation.model.status import OK
 from dmrl.estimation.solver.problem import NoiseModel
 from dmrl.estimation.solver.robust_loss import Array, Cauchy, Gaussian, Loss
 
-from ..flights import flown, pair_of
+from ..flights import build_pair, simulate_flight
 
 
 @dataclass(frozen=True, slots=True)
 class Huber:
-    """The square up to a residual s, its tangent beyond.
+    """Huber loss: quadratic up to a residual s, linear beyond.
 
     Parameters
     ----------
@@ -71,8 +71,8 @@ def test_residual_at_the_cauchy_scale_has_half_weight() -> None:
 
 @pytest.mark.heavy
 def test_huber_loss_replaces_cauchy_by_argument() -> None:
-    flight = flown("random", "calibrated", 1001, 40.0)
+    flight = simulate_flight("random", "calibrated", 1001, 40.0)
     noise = replace(NoiseModel(grade=0.63), range_loss=Huber(1.25), motion_loss=Huber(3.0))
-    ((here, there),) = estimate_pairs([pair_of(flight)], noise=noise)
+    ((here, there),) = estimate_pairs([build_pair(flight)], noise=noise)
     assert (here.status == OK).mean() > 0.5
     assert (there.status == OK).mean() > 0.5

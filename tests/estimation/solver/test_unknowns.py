@@ -1,4 +1,4 @@
-"""The table of unknowns, from which the layout, priors and files derive."""
+"""The table of unknowns, from which layout, priors and sensor files are derived."""
 
 from dataclasses import replace
 
@@ -15,7 +15,7 @@ from dmrl.estimation.solver.robust_loss import Cauchy, Gaussian
 from dmrl.estimation.solver.unknowns import SIGHTED, TABLE, Unknown, with_rows, without_rows
 from dmrl.labelling.sensor_file import OF_PAIR, OF_ROBOT, SCALES
 
-from ..flights import flown, pair_of
+from ..flights import build_pair, simulate_flight
 
 ROWS = {row.name: row for row in TABLE}
 PRIORS = {
@@ -72,7 +72,7 @@ def test_layout_has_one_column_per_owner() -> None:
     subjects = [subject for subject, _ in layout.constants]
     assert [own for name, own in subjects if name == "range_offset"] == [(0, 1), (1, 2)]
     assert [own for name, own in subjects if name == "gyro_bias"] == [(0,), (1,), (2,)]
-    # The first robot's clock counts.
+    # The clock of the first robot is the reference, so it has no unknown.
     assert [own for name, own in subjects if name == "clock"] == [(1,), (2,)]
     assert not {name for name, _ in subjects} & set(SIGHTED)
     assert layout.width == 9 + 2 * 3 + 2
@@ -121,7 +121,7 @@ def test_step_model_follows_evolution_of_the_unknown() -> None:
     steps_s = np.array([0.01, 0.2, 100.0])
     fading = Unknown("a", "m", 0.08, "robot", evolution="fading", time_s=0.3)
     kept, std = fading.step_model(steps_s)
-    # Ornstein-Uhlenbeck: new noise at the rate of 2 std^2 / tau at first, all of it after long.
+    # Ornstein-Uhlenbeck: the variance grows by 2 std^2 / tau per second, up to std^2.
     assert kept == pytest.approx(np.exp(-steps_s / 0.3))
     assert std[0] ** 2 == pytest.approx(2 * 0.08**2 * 0.01 / 0.3, rel=0.05)
     assert std[2] == pytest.approx(0.08)
@@ -136,19 +136,19 @@ def test_rows_are_replaced_by_name_and_removed() -> None:
     assert "clock" not in [row.name for row in without_rows(TABLE, ("clock",))]
 
 
-def _pattern(link: RangeLink, sight: Sight) -> Array:
-    """Ranges that grow over the flight."""
+def _compute_drift(link: RangeLink, sight: Sight) -> Array:
+    """Return the effect of a linear range drift over 40 s."""
     return np.asarray((link.time_s - 20.0) / 20.0) + 0 * sight.distance
 
 
 @pytest.mark.heavy
 def test_a_new_unknown_is_one_row_in_a_copy_of_the_table() -> None:
-    """A drift of the ranges is found by a row with one effect, and by nothing else."""
-    flight = flown("random", "calibrated", 1001, 40.0)
-    pair = pair_of(flight)
+    """A drift of the ranges is estimated after adding one row to the table."""
+    flight = simulate_flight("random", "calibrated", 1001, 40.0)
+    pair = build_pair(flight)
     drift_m = 0.5
     late = replace(pair, range_m=pair.range_m + drift_m * (pair.range_time_s - 20.0) / 20.0)
-    row = Unknown("range_drift", "m", 0.5, "pair", range=_pattern)
+    row = Unknown("range_drift", "m", 0.5, "pair", range=_compute_drift)
     problem = build_problem({(0, 1): late})
     found = solve_pair(replace(problem, table=with_rows(TABLE, row)))
     layout = found.problem.layout
@@ -162,7 +162,9 @@ def test_a_new_unknown_is_one_row_in_a_copy_of_the_table() -> None:
 
 @pytest.mark.heavy
 def test_the_order_of_the_rows_does_not_matter() -> None:
-    problem = build_problem({(0, 1): pair_of(flown("random", "calibrated", 1001, 20.0))})
+    problem = build_problem(
+        {(0, 1): build_pair(simulate_flight("random", "calibrated", 1001, 20.0))}
+    )
     one, other = (
         solve_pair(replace(problem, table=table), NoiseModel(grade=0.63))
         for table in (TABLE, TABLE[::-1])

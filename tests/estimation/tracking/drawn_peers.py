@@ -1,4 +1,4 @@
-"""Peers that move at random, and a detector with the errors of the tuning."""
+"""Simulated peers and a detector that match the tracker's tuning."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -23,10 +23,10 @@ DT_S = 0.1
 
 @dataclass(frozen=True)
 class Detector:
-    """What a network makes of peers in view: noise as the tuning says, misses, false alarms.
+    """A simulated network with the noise of the tuning, misses and false alarms.
 
-    Confidences are calibrated: of both kinds, the log odds are normal with unit variance, their
-    means two apart. So the log likelihood ratio of a logit is 2 logit, `CALIBRATED`.
+    The logits of true and false detections are normal with unit variance and means of 1 and -1.
+    So the log likelihood ratio of a logit is 2 logit, as in `CALIBRATED`.
     """
 
     rng: np.random.Generator
@@ -59,8 +59,8 @@ class Detector:
 CALIBRATED = DetectorRates(0.0, (1.0,), (0.7,), 0.3, 2.0, 0.0)
 
 
-def wandering(rng: np.random.Generator, steps: int, start: Array) -> Iterator[Array]:
-    """Positions of a peer whose velocity is as the tuning says, metres."""
+def simulate_path(rng: np.random.Generator, steps: int, start: Array) -> Iterator[Array]:
+    """Yield positions (3,) of a peer with the velocity model of the tuning, metres."""
     place, std = start.copy(), np.array([TUNING.speed_std_mps] * 2 + [TUNING.climb_std_mps])
     speed, fine = std * rng.normal(size=3), DT_S / 10
     calm = np.exp(-fine / TUNING.velocity_s)
@@ -68,11 +68,12 @@ def wandering(rng: np.random.Generator, steps: int, start: Array) -> Iterator[Ar
         for _ in range(10):
             place = place + fine * speed
             speed = calm * speed + np.sqrt(1 - calm**2) * std * rng.normal(size=3)
-        place = place + 1.0 * DT_S * (start - place)  # it stays in view
+        place = place + 1.0 * DT_S * (start - place)  # pull it back, so that it stays in view
         yield place
 
 
-def depth_biases(rng: np.random.Generator, steps: int, peers: int) -> Iterator[Array]:
+def simulate_depth_biases(rng: np.random.Generator, steps: int, peers: int) -> Iterator[Array]:
+    """Yield correlated relative depth errors (peers,)."""
     keep = np.exp(-DT_S / TUNING.depth_bias_s)
     bias = rng.normal(size=peers)
     for _ in range(steps):
@@ -82,7 +83,7 @@ def depth_biases(rng: np.random.Generator, steps: int, peers: int) -> Iterator[A
 
 @dataclass
 class Outcome:
-    """One run: squared errors of tracks and of single detections, and who was followed."""
+    """Result of a run: squared errors of tracks and of single detections, and track numbers."""
 
     squared: list[float]
     track_m2: list[float]
@@ -91,13 +92,14 @@ class Outcome:
     false_tracks: int
 
 
-def followed(seed: int, starts: Array, steps: int = 600) -> Outcome:
+def run_tracker(seed: int, starts: Array, steps: int = 600) -> Outcome:
+    """Track simulated peers that start at (K, 3) positions, and compare with the truth."""
     rng = np.random.default_rng(seed)
     tracker, detector = Tracker(AIDECK, TUNING, CALIBRATED), Detector(rng)
-    paths = [wandering(rng, steps, start) for start in starts]
+    paths = [simulate_path(rng, steps, start) for start in starts]
     out = Outcome([], [], [], [], 0)
     false: set[int] = set()
-    for biases in depth_biases(rng, steps, len(starts)):
+    for biases in simulate_depth_biases(rng, steps, len(starts)):
         truth = np.array([next(path) for path in paths])
         view = detector.view(truth, biases)
         tracks = tracker.step(EgoMotion(DT_S, np.zeros(3), 0.0), view)

@@ -1,4 +1,4 @@
-"""Names of tracks by ranges: clear and ambiguous cases."""
+"""Tracks get the names of peers by their ranges, unless that is ambiguous."""
 
 from dataclasses import dataclass, field
 
@@ -10,7 +10,7 @@ from dmrl.estimation.tracking.identity import AVERAGING_S, RANGE_STD_M, TrackIde
 
 @dataclass
 class Track:
-    """What `Identity` asks of a track: straight ahead, at some distance."""
+    """A track straight ahead, with only the fields that `TrackIdentity` uses."""
 
     number: int
     distance_m: float
@@ -20,10 +20,11 @@ class Track:
 
     def __post_init__(self) -> None:
         self.position_m = np.array([self.distance_m, 0.0, 0.0])
-        self.covariance = np.diag([self.std_m**2, 9.0, 9.0])  # across does not matter
+        self.covariance = np.diag([self.std_m**2, 9.0, 9.0])  # only the first axis matters
 
 
-def names(tracks: list[Track], times: int = 1, **range_m: float) -> dict[int, str]:
+def assign_names(tracks: list[Track], times: int = 1, **range_m: float) -> dict[int, str]:
+    """Assign names to tracks by ranges that are measured a number of times."""
     identity = TrackIdentity()
     for _ in range(times):
         found = identity.assign(tracks, range_m, 0.1)  # type: ignore[arg-type]
@@ -34,8 +35,8 @@ def names(tracks: list[Track], times: int = 1, **range_m: float) -> dict[int, st
 def test_a_range_fits_within_two_sigmas_of_itself_and_the_track(sigmas: float, named: bool) -> None:
     std_m = 0.3
     apart = sigmas * np.hypot(RANGE_STD_M, std_m)
-    assert bool(names([Track(1, 2.0, std_m)], cf2=2.0 + apart)) == named
-    assert bool(names([Track(1, 2.0, std_m)], cf2=2.0 - apart)) == named
+    assert bool(assign_names([Track(1, 2.0, std_m)], cf2=2.0 + apart)) == named
+    assert bool(assign_names([Track(1, 2.0, std_m)], cf2=2.0 - apart)) == named
 
 
 @pytest.mark.parametrize(
@@ -44,15 +45,15 @@ def test_a_range_fits_within_two_sigmas_of_itself_and_the_track(sigmas: float, n
 )
 def test_name_needs_a_clear_margin_over_others(best: float, misfit: float, named: bool) -> None:
     one, other = 2.0 - RANGE_STD_M * np.sqrt([best, misfit])
-    assert bool(names([Track(1, 2.0)], cf2=one, cf3=other)) == named
+    assert bool(assign_names([Track(1, 2.0)], cf2=one, cf3=other)) == named
 
 
 def test_names_are_assigned_jointly_to_two_tracks() -> None:
-    assert names([Track(1, 1.0), Track(2, 3.0)], cf2=3.0, cf3=1.0) == {1: "cf3", 2: "cf2"}
+    assert assign_names([Track(1, 1.0), Track(2, 3.0)], cf2=3.0, cf3=1.0) == {1: "cf3", 2: "cf2"}
 
 
-def test_a_name_stands_by_itself_where_another_track_fits_no_peer() -> None:
-    assert names([Track(1, 1.0), Track(2, 3.0)], cf2=5.0, cf3=1.0) == {1: "cf3"}
+def test_a_track_is_named_although_another_one_fits_no_peer() -> None:
+    assert assign_names([Track(1, 1.0), Track(2, 3.0)], cf2=5.0, cf3=1.0) == {1: "cf3"}
 
 
 def test_single_range_outlier_is_bounded_and_forgotten() -> None:
@@ -63,7 +64,7 @@ def test_single_range_outlier_is_bounded_and_forgotten() -> None:
         ranges = {"cf2": 2.0 if k else 60.0, "cf3": 9.0}
         found = identity.assign(track, ranges, 0.1)  # type: ignore[arg-type]
         if k == round(0.5 * AVERAGING_S / 0.1):
-            assert not found  # 9 e^-0.5 is still more than 4
+            assert not found  # the averaged misfit, 9 e^-0.5, is still above 4
     assert found == {1: "cf2"}
 
 

@@ -1,4 +1,4 @@
-"""Track figures of given errors."""
+"""Figures of tracks, compared with values computed by hand."""
 
 from dataclasses import replace
 
@@ -17,8 +17,11 @@ ERRORS = np.array([[0.3, 0.0, 0.0], [0.0, 0.4, 0.0], [0.0, 0.0, 1.2], NOTHING])
 SINGLES = np.array([[0.6, 0.0, 0.0], [0.0, 0.8, 0.0], NOTHING, [2.0, 0.0, 0.0]])
 
 
-def judged() -> EvaluatedTracks:
-    """Four peers in view, one a second; the third without a detection, the fourth without track."""
+def build_tracks() -> EvaluatedTracks:
+    """Return four peers in view, one per second.
+
+    The third has no single detection, and the fourth has no track.
+    """
     return EvaluatedTracks(
         "cf1",
         np.arange(4.0),
@@ -33,29 +36,31 @@ def judged() -> EvaluatedTracks:
 
 
 def test_track_figures_equal_hand_computed_values() -> None:
-    found = compute_figures(judged(), 0.0)
+    found = compute_figures(build_tracks(), 0.0)
     assert found["in_view"] == 4
-    assert found["rmse_m"] == pytest.approx(np.sqrt((0.09 + 0.16) / 2))  # of those with both
+    assert found["rmse_m"] == pytest.approx(np.sqrt((0.09 + 0.16) / 2))  # peers with both errors
     assert found["single_rmse_m"] == pytest.approx(np.sqrt((0.36 + 0.64) / 2))
     assert found["reduction"] == pytest.approx(0.5)
     assert (found["median_m"], found["single_median_m"]) == pytest.approx((0.35, 0.7))
     assert found["nees"] == pytest.approx((9 + 4 + 9) / 3)
-    assert found["coverage_95"] == pytest.approx(1 / 3)  # 4 is below 7.8, 9 is not
-    assert (found["followed"], found["detected"]) == (0.5, 0.5)  # 1.2 m is not near
+    assert found["coverage_95"] == pytest.approx(1 / 3)  # the limit is 7.8; the values 9, 4, 9
+    assert (found["followed"], found["detected"]) == (0.5, 0.5)  # an error of 1.2 m is too large
     assert found["false_tracks_per_min"] == pytest.approx(2.0)
     assert found["named_right"] == 0.5
 
 
 def test_only_false_tracks_count_before_settling() -> None:
-    found = compute_figures(judged(), 1.0)
+    found = compute_figures(build_tracks(), 1.0)
     assert (found["in_view"], found["rmse_m"]) == (3, pytest.approx(0.4))
     assert (found["named_right"], found["false_tracks_per_min"]) == (0.0, pytest.approx(2.0))
-    nothing = compute_figures(judged(), 9.0)
+    nothing = compute_figures(build_tracks(), 9.0)
     assert {name: value for name, value in nothing.items() if value is not None} == {
         "in_view": 0.0,
         "false_tracks_per_min": pytest.approx(2.0),
     }
-    assert compute_figures(replace(judged(), length_s=0.0), 0.0)["false_tracks_per_min"] is None
+    assert (
+        compute_figures(replace(build_tracks(), length_s=0.0), 0.0)["false_tracks_per_min"] is None
+    )
 
 
 def test_coverage_uses_the_95_percent_ellipsoid_in_three_dimensions() -> None:

@@ -18,12 +18,20 @@ from dmrl.geometry.frames import (
     pixels_from_horizontal,
 )
 
-from .drawn_peers import CALIBRATED, DT_S, TUNING, Detector, depth_biases, followed, wandering
+from .drawn_peers import (
+    CALIBRATED,
+    DT_S,
+    TUNING,
+    Detector,
+    run_tracker,
+    simulate_depth_biases,
+    simulate_path,
+)
 
 
 @pytest.mark.heavy
 def test_a_peer_is_followed_through_misses_and_false_alarms() -> None:
-    run = followed(1, np.array([[1.5, 0.0, 0.0]]), steps=150)
+    run = run_tracker(1, np.array([[1.5, 0.0, 0.0]]), steps=150)
     assert len(run.ids) > 100
     longest = max(run.ids.count(number) for number in set(run.ids))
     assert longest > 0.4 * len(run.ids)
@@ -32,13 +40,13 @@ def test_a_peer_is_followed_through_misses_and_false_alarms() -> None:
 
 @pytest.mark.heavy
 def test_tracker_covariance_is_consistent_under_its_model() -> None:
-    """No false alarms, no misses: what is left is the filter's own arithmetic."""
+    """There are no false alarms and no misses, so only the filter itself is tested."""
     squared: list[float] = []
     for seed in range(8):
         rng = np.random.default_rng(seed)
         tracker, detector = Tracker(AIDECK, TUNING, CALIBRATED), Detector(rng, 1.0, 0.0)
-        path = wandering(rng, 60, np.array([1.5, 0.0, 0.0]))
-        for truth, bias in zip(path, depth_biases(rng, 60, 1), strict=True):
+        path = simulate_path(rng, 60, np.array([1.5, 0.0, 0.0]))
+        for truth, bias in zip(path, simulate_depth_biases(rng, 60, 1), strict=True):
             for track in tracker.step(STILL, detector.view(truth[None], bias)):
                 error = track.position_m - truth
                 squared.append(error @ np.linalg.inv(track.covariance) @ error)
@@ -47,13 +55,13 @@ def test_tracker_covariance_is_consistent_under_its_model() -> None:
 
 @pytest.mark.heavy
 def test_tracker_weights_depths_by_their_sigma() -> None:
-    """Every other depth is off by 40 %, the rest by 3 %: one tracker is told which."""
+    """Depths alternate between 40 % and 3 % noise, and only one tracker gets the sigmas."""
     told, untold, squared = [], [], []
     for seed in range(4):
         rng = np.random.default_rng(seed)
         trackers = Tracker(AIDECK, TUNING), Tracker(AIDECK, TUNING)
-        for step, truth in enumerate(wandering(rng, 80, np.array([1.5, 0.0, 0.0]))):
-            seen = view_of(truth[None])
+        for step, truth in enumerate(simulate_path(rng, 80, np.array([1.5, 0.0, 0.0]))):
+            seen = project_peers(truth[None])
             uv = seen.uv + TUNING.pixel_std_px * rng.normal(size=2)
             ratio = (0.03, 0.4)[step % 2]
             depth_m = seen.depth_m * np.exp(ratio * rng.normal(size=1))
@@ -69,9 +77,10 @@ def test_tracker_weights_depths_by_their_sigma() -> None:
     assert np.mean(np.array(squared) <= chi2.ppf(0.95, 3)) >= 0.88
 
 
-def view_of(
+def project_peers(
     xyz: Array, roll_rad: float = 0.0, pitch_rad: float = 0.0, confidence: float = 0.9
 ) -> ImageDetections:
+    """Return exact detections of peers at (K, 3) positions, horizontal frame, metres."""
     angles = np.full(len(xyz), roll_rad), np.full(len(xyz), pitch_rad)
     uv, depth_m, _ = pixels_from_horizontal(xyz, *angles, AIDECK)
     return ImageDetections(uv, depth_m, roll_rad, pitch_rad, np.full(len(xyz), confidence))
@@ -93,7 +102,7 @@ def test_static_peer_has_zero_velocity_for_a_moving_observer() -> None:
         c, s = np.cos(yaw), np.sin(yaw)
         x, y, z = peer - own
         here = np.array([[c * x + s * y, -s * x + c * y, z]])
-        tracks = tracker.step(EgoMotion(DT_S, step, turn), view_of(here, 0.1, -0.05))
+        tracks = tracker.step(EgoMotion(DT_S, step, turn), project_peers(here, 0.1, -0.05))
     (track,) = tracks
     assert np.allclose(track.position_m, here[0], atol=0.02)
     assert np.abs(track.velocity_mps).max() < 0.05
@@ -103,9 +112,9 @@ def test_static_peer_has_zero_velocity_for_a_moving_observer() -> None:
 def test_track_of_peer_out_of_view_outlives_a_missing_one() -> None:
     tracker = Tracker(AIDECK, TUNING)
     for _ in range(10):
-        tracker.step(STILL, view_of(np.array([[1.5, 0.0, 0.0]])))
+        tracker.step(STILL, project_peers(np.array([[1.5, 0.0, 0.0]])))
     assert len(tracker.step(STILL, NOTHING)) == 1
-    turned = EgoMotion(DT_S, np.zeros(3), 1.5)  # the peer is now beside the image
+    turned = EgoMotion(DT_S, np.zeros(3), 1.5)  # the peer is then out of view
     assert len(tracker.step(turned, NOTHING)) == 1
     assert all(len(tracker.step(STILL, NOTHING)) == 1 for _ in range(3))
     for _ in range(300):
@@ -119,7 +128,7 @@ def test_single_false_alarms_never_become_tracks() -> None:
     for _ in range(100):
         xyz = np.array([[rng.uniform(0.5, 3.0), 0.0, 0.0]]) * [1.0, 1.0, 1.0]
         xyz[0, 1:] = xyz[0, 0] * rng.uniform(-0.4, 0.4, 2)
-        view = view_of(xyz, confidence=0.5) if rng.random() < 0.3 else NOTHING
+        view = project_peers(xyz, confidence=0.5) if rng.random() < 0.3 else NOTHING
         assert not tracker.step(STILL, view)
 
 
@@ -128,7 +137,7 @@ def test_single_false_alarms_never_become_tracks() -> None:
 def test_confidence_decides_when_a_lasting_detection_is_a_peer(
     confidence: float, images: int | None
 ) -> None:
-    tracker, view = Tracker(AIDECK, TUNING), view_of(np.array([[1.2, 0.1, 0.0]]))
+    tracker, view = Tracker(AIDECK, TUNING), project_peers(np.array([[1.2, 0.1, 0.0]]))
     view = replace(view, confidence=np.array([confidence]))
     seen = [bool(tracker.step(STILL, view)) for _ in range(60)]
     if images is None:
@@ -141,12 +150,12 @@ def test_confidence_decides_when_a_lasting_detection_is_a_peer(
 @pytest.mark.parametrize(
     ("share_of_memory", "confidences", "told"),
     [
-        (1e-6, (0.8, 0.8), 0.0),  # nothing is new
-        (1e-6, (0.8, 0.95), 0.5),  # half of the change
-        (50.0, (0.8, 0.95), 1.0),  # all of it: the image before is forgotten
+        (1e-6, (0.8, 0.8), 0.0),  # an equal confidence adds nothing
+        (1e-6, (0.8, 0.95), 0.5),  # half of the change counts
+        (50.0, (0.8, 0.95), 1.0),  # much later the full confidence counts
     ],
 )
-def test_a_confidence_tells_what_the_image_before_did_not(
+def test_only_the_change_of_a_confidence_counts(
     monkeypatch: pytest.MonkeyPatch,
     share_of_memory: float,
     confidences: tuple[float, float],
@@ -156,9 +165,9 @@ def test_a_confidence_tells_what_the_image_before_did_not(
     tracker, spy = Tracker(AIDECK, TUNING), Mock(side_effect=associate)
     monkeypatch.setattr("dmrl.estimation.tracking.tracker.associate", spy)
     first, second = confidences
-    tracker.step(STILL, view_of(peer, confidence=first))
+    tracker.step(STILL, project_peers(peer, confidence=first))
     later = replace(STILL, dt_s=share_of_memory * TUNING.confidence_s)
-    tracker.step(later, view_of(peer, confidence=second))
+    tracker.step(later, project_peers(peer, confidence=second))
     before, now = tracker.rates.log_ratio(np.array(confidences))
     bright = spy.call_args.args[3]
     assert np.log(bright) == pytest.approx(told * (now - (told < 1) * before), abs=1e-4)
@@ -166,14 +175,14 @@ def test_a_confidence_tells_what_the_image_before_did_not(
 
 @pytest.mark.heavy
 def test_weak_detections_keep_an_expected_track_accurate() -> None:
-    """Of two tracks, one gets weak detections and the other none."""
+    """One of two equal tracks gets weak detections, the other none."""
     weak, blind = Tracker(AIDECK, TUNING), Tracker(AIDECK, TUNING)
     peer = np.array([[1.2, 0.1, 0.0]])
     for _ in range(20):
-        weak.step(STILL, view_of(peer))
-        blind.step(STILL, view_of(peer))
+        weak.step(STILL, project_peers(peer))
+        blind.step(STILL, project_peers(peer))
     for _ in range(15):
-        (held,) = weak.step(STILL, view_of(peer, confidence=0.1))
+        (held,) = weak.step(STILL, project_peers(peer, confidence=0.1))
         (coasts,) = blind.step(STILL, NOTHING)
     assert held.unseen_s == 0.0
     assert coasts.unseen_s == pytest.approx(1.5)
@@ -187,7 +196,7 @@ def test_missed_detections_lower_existence_more_at_short_distance() -> None:
     for distance_m in (0.75, 1.75):
         tracker = Tracker(AIDECK, TUNING)
         for _ in range(20):
-            tracker.step(STILL, view_of(np.array([[distance_m, 0.0, 0.0]])))
+            tracker.step(STILL, project_peers(np.array([[distance_m, 0.0, 0.0]])))
         before = float(tracker.states.existence[0])
         for _ in range(10):
             (track,) = tracker.step(STILL, NOTHING)
@@ -202,7 +211,7 @@ def test_two_tracks_keep_numbers_and_are_named_by_range() -> None:
     distances = dict(zip(("cf2", "cf3"), np.linalg.norm(peers, axis=1).tolist(), strict=True))
     numbers = set()
     for _ in range(40):
-        tracks = tracker.step(STILL, view_of(peers))
+        tracks = tracker.step(STILL, project_peers(peers))
         names = identity.assign(tracks, distances, DT_S)
         numbers |= {track.number for track in tracks}
     assert len(numbers) == 2
@@ -214,7 +223,7 @@ def test_two_tracks_keep_numbers_and_are_named_by_range() -> None:
 def test_track_without_matching_range_has_no_name() -> None:
     tracker, identity = Tracker(AIDECK, TUNING), TrackIdentity()
     for _ in range(40):
-        tracks = tracker.step(STILL, view_of(np.array([[1.0, 0.0, 0.0]])))
+        tracks = tracker.step(STILL, project_peers(np.array([[1.0, 0.0, 0.0]])))
         names = identity.assign(tracks, {"cf2": 4.0, "cf3": 5.0}, DT_S)
     assert tracks
     assert not names
@@ -227,18 +236,18 @@ def test_tracker_accepts_empty_images_and_pixels_beyond_the_lens_model() -> None
     assert tracker.step(STILL, far_out) == []
 
 
-def started(xyz: Array) -> TrackStates:
-    """The states after a first image of one peer."""
+def start_track(xyz: Array) -> TrackStates:
+    """Return the states after a first image of one peer."""
     tracker = Tracker(AIDECK, TUNING)
-    tracker.step(EgoMotion(0.0, np.zeros(3), 0.0), view_of(xyz))
+    tracker.step(EgoMotion(0.0, np.zeros(3), 0.0), project_peers(xyz))
     return tracker.states
 
 
 @pytest.mark.heavy
 def test_predicted_covariance_matches_simulated_motion_model() -> None:
-    """Against a simulation of the tuning's words: Gauss-Markov velocity, drift, heading."""
+    """Samples have the Gauss-Markov velocity, position drift and heading drift of the tuning."""
     rng, count, dt_s, steps = default_rng(2), 20_000, 0.1, 12
-    states = started(np.array([[1.5, 0.2, -0.1]]))
+    states = start_track(np.array([[1.5, 0.2, -0.1]]))
     (mean,), (covariance,) = states.cartesian()
     drawn = rng.multivariate_normal(mean, covariance, count)
     t = TUNING
@@ -259,12 +268,12 @@ def test_predicted_covariance_matches_simulated_motion_model() -> None:
 
 
 def test_prediction_subtracts_the_observer_motion() -> None:
-    states = started(np.array([[2.0, 0.3, 0.1]]))
-    states.mean[0, 3:6] = 0.5, 0.0, -0.2  # over ground, along the axes before the turn
+    states = start_track(np.array([[2.0, 0.3, 0.1]]))
+    states.mean[0, 3:6] = 0.5, 0.0, -0.2  # velocity over ground, in axes before the turn
     states.predict(EgoMotion(0.5, np.array([0.4, 0.1, 0.05]), np.pi / 2), TUNING)
     calm = np.exp(-0.5 / TUNING.velocity_s)
     reach_s = TUNING.velocity_s * (1 - calm)
-    # Ahead by 2 + 0.5 reach - 0.4 and left by 0.3 - 0.1; after a quarter turn left that is right.
+    # Before the turn: x = 2 + 0.5 reach - 0.4, y = 0.3 - 0.1. After 90 degrees left: (y, -x).
     place = [0.2, -1.6 - 0.5 * reach_s, 0.05 - 0.2 * reach_s]
     (mean,), _ = states.cartesian()
     assert mean == pytest.approx([*place, 0.0, -0.5 * calm, -0.2 * calm])
@@ -272,7 +281,7 @@ def test_prediction_subtracts_the_observer_motion() -> None:
 
 def test_depth_noise_is_sigma_relative_to_depth() -> None:
     view = replace(
-        view_of(np.ones((3, 3))),
+        project_peers(np.ones((3, 3))),
         depth_m=np.array([2.0, 4.0, 1.0]),
         sigma_depth_m=np.array([0.3, 0.3, 0.0]),
     )
@@ -305,9 +314,9 @@ def test_covariance_of_a_new_track_matches_sampled_detections() -> None:
 @pytest.mark.heavy
 def test_constant_tilt_bias_stays_in_the_covariance() -> None:
     tracker, xyz = Tracker(AIDECK, TUNING), np.array([[1.5, 0.0, 0.0]])
-    tracker.step(STILL, view_of(xyz))
+    tracker.step(STILL, project_peers(xyz))
     for _ in range(200):
-        (track,) = tracker.step(STILL, view_of(xyz))
+        (track,) = tracker.step(STILL, project_peers(xyz))
     plain = np.sqrt(tracker.states.cartesian()[1][0, 2, 2])
     silent = tracker.states.belief[0, SILENT] / track.existence
     captured = TUNING.capture_std_m * np.sqrt(silent)
@@ -317,7 +326,7 @@ def test_constant_tilt_bias_stays_in_the_covariance() -> None:
 
 
 def test_shared_detection_is_weighted_between_tracks() -> None:
-    """By hand: two tracks that exist surely, one detection, likelihood ratios 50 and 10."""
+    """Two certain tracks share a detection with likelihood ratios of 50 and 10."""
     belief = np.array([[0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 1.0, 0.0]])
     found = np.tile([0.0, 0.9, 0.9, 0.03], (2, 1))
     near = np.array([[50.0], [10.0]])
