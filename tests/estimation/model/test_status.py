@@ -7,6 +7,7 @@ from dmrl.estimation.model.status import (
     AMBIGUOUS,
     OK,
     UNCONVERGED,
+    classify_positions,
     probability_beyond,
     select_within_budget,
 )
