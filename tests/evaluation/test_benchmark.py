@@ -1,4 +1,4 @@
-"""The benchmark: submitted networks and labels are scored, and copies of the truth refused."""
+"""The benchmark scores submitted networks and labels, and refuses copies of the truth."""
 
 import csv
 import json
@@ -24,7 +24,7 @@ TRUTH = "/cf1/peer/cf2/truth"
 
 
 def write_boxes(path: Path, rows: list[list[float]], threshold: str = "0.6") -> Path:
-    """A detector that finds the same boxes in every image."""
+    """Write an ONNX detector that returns the same boxes for every image."""
     value = numpy_helper.from_array(np.array([rows], np.float32), "rows")
     image = helper.make_tensor_value_info("pixels", TensorProto.FLOAT, [1, 3, 224, 320])
     found = helper.make_tensor_value_info("found", TensorProto.FLOAT, list(np.shape([rows])))
@@ -39,7 +39,7 @@ def write_boxes(path: Path, rows: list[list[float]], threshold: str = "0.6") -> 
 
 
 def write_maps(path: Path, rows: int = 28, red: float = 1 / 64) -> Path:
-    """A network whose confidence is the mean red of a cell, and whose depth is constant."""
+    """Write an ONNX network whose confidence is the mean red of a cell; its depth is constant."""
     image = helper.make_tensor_value_info("image", TensorProto.FLOAT, ["n", 3, 224, 320])
     kernel = np.zeros((1, 3, 8, 8), np.float32)
     kernel[0, 0] = red
@@ -96,7 +96,7 @@ def test_maps_are_read_by_name_and_others_refused(tmp_path: Path) -> None:
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, Path]:
-    """A flight with its truth, and what participants get of it, with and without ranges."""
+    """Write a flight with truth, and the public recordings of it with and without ranges."""
     folder = tmp_path_factory.mktemp("scene")
     fly.run(folder / "scene.mcap", fly.Settings(seed=91_001, trajectory="random", duration_s=30))
     topic = ("/*/attitude", "/*/velocity", "/*/height", "/*/range/*")
@@ -106,7 +106,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, Path]:
 
 
 def write_labels(path: Path, source: Path, scene: Path, error_m: float) -> Path:
-    """The truth, with an error, as labels of a recording."""
+    """Write the truth plus noise as submitted labels of a recording."""
     table = read_table(scene, TRUTH)
     rng, sha256 = np.random.default_rng(0), build_input(source).sha256
     with path.open("w", newline="") as stream:

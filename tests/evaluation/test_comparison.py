@@ -1,4 +1,4 @@
-"""Two models on the same images: the interval of their difference, and what is no such pair."""
+"""Two models are compared on their common images, with intervals of the differences."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -12,13 +12,14 @@ from dmrl.learn.inference.matching import Points
 IMAGES = 200
 
 
-def evaluated(name: str, labels: Points, error_px: np.ndarray) -> LabelledDetections:
+def build_evaluated(name: str, labels: Points, error_px: np.ndarray) -> LabelledDetections:
+    """Return labelled detections whose u is off by an error in each image."""
     found = replace(labels, u_px=labels.u_px + error_px)
     at = [ImageKey(Path(f"{name}.mcap"), "cf1", k) for k in range(len(labels))]
     return LabelledDetections(at, labels, found, 0.5)
 
 
-def some_labels(seed: int = 0) -> Points:
+def draw_labels(seed: int = 0) -> Points:
     rng = np.random.default_rng(seed)
     u_px, v_px = rng.uniform(20, 200, (2, IMAGES))
     return Points(np.arange(IMAGES), u_px, v_px, rng.uniform(0.3, 2, IMAGES), np.ones(IMAGES))
@@ -26,8 +27,10 @@ def some_labels(seed: int = 0) -> Points:
 
 def test_an_error_common_to_both_is_not_in_the_interval_of_the_difference() -> None:
     common = np.random.default_rng(1).gamma(2.0, 2.0, IMAGES)
-    labels = some_labels()
-    both = align_images(evaluated("a", labels, common), evaluated("b", labels, common + 0.5))
+    labels = draw_labels()
+    both = align_images(
+        build_evaluated("a", labels, common), build_evaluated("b", labels, common + 0.5)
+    )
     assert both is not None
     made = compare_models(both, (0.5, 0.5), draws=200, seed=3)
     mean = made["figures"]["mean_px"]
@@ -46,11 +49,11 @@ def test_an_error_common_to_both_is_not_in_the_interval_of_the_difference() -> N
 
 
 def test_common_images_alone_are_compared_in_one_order() -> None:
-    labels = some_labels()
-    first = evaluated("a", labels, np.zeros(IMAGES))
+    labels = draw_labels()
+    first = build_evaluated("a", labels, np.zeros(IMAGES))
     turned = np.arange(IMAGES)[::-1][: IMAGES // 2]
     part = Points(np.arange(len(turned)), *(c[turned] for c in labels._columns()))
-    second = evaluated("b", part, np.full(len(turned), 3.0))
+    second = build_evaluated("b", part, np.full(len(turned), 3.0))
     second = replace(second, at=[ImageKey(Path("b.mcap"), "cf1", int(k)) for k in turned])
     both = align_images(first, second)
     assert both is not None and [one.images for one in both] == [IMAGES // 2] * 2
@@ -59,10 +62,10 @@ def test_common_images_alone_are_compared_in_one_order() -> None:
     assert np.isclose(made["figures"]["mean_px"]["difference"]["value"], 3.0)
 
 
-def test_other_images_of_the_same_moments_are_no_pair() -> None:
+def test_recordings_with_different_labels_or_times_are_not_compared() -> None:
     zeros = np.zeros(IMAGES)
-    first = evaluated("a", some_labels(), zeros)
-    assert align_images(first, evaluated("b", some_labels(1), zeros)) is None
-    later = evaluated("b", some_labels(), zeros)
+    first = build_evaluated("a", draw_labels(), zeros)
+    assert align_images(first, build_evaluated("b", draw_labels(1), zeros)) is None
+    later = build_evaluated("b", draw_labels(), zeros)
     later = replace(later, at=[at._replace(time_ns=at.time_ns + IMAGES) for at in later.at])
     assert align_images(first, later) is None

@@ -1,4 +1,4 @@
-"""Figures of a recipe: checked with the recipe, and read from JSON files."""
+"""Figures of a recipe: their specification is checked, and values are found in JSON files."""
 
 from typing import Any
 
@@ -11,7 +11,7 @@ OUTS = {"model", "judged", "a.mcap"}
 GOOD = {"title": "Losses", "shows": "losses", "of": ["model"]}
 
 
-def wrong(table: Any) -> str:
+def list_faults(table: Any) -> str:
     return "; ".join(iter_faults({"figure": [table]}, OUTS))
 
 
@@ -39,7 +39,7 @@ def test_valid_figure_specs_are_read() -> None:
     ],
 )
 def test_a_wrong_figure_is_a_fault_of_the_recipe(change: dict[str, Any], says: str) -> None:
-    assert says in wrong(GOOD | change)
+    assert says in list_faults(GOOD | change)
 
 
 @pytest.mark.parametrize(
@@ -47,12 +47,14 @@ def test_a_wrong_figure_is_a_fault_of_the_recipe(change: dict[str, Any], says: s
 )
 def test_invalid_or_oversized_number_format_is_a_fault(form: str) -> None:
     row = {"what": "px", "of": "judged", "at": "x", "form": form}
-    assert "is not a number format" in wrong({"title": "N", "shows": "numbers", "rows": [row]})
+    assert "is not a number format" in list_faults(
+        {"title": "N", "shows": "numbers", "rows": [row]}
+    )
 
 
 def test_invalid_tables_are_faults() -> None:
     assert "must be [[figure]] tables" in "".join(iter_faults({"figure": 3}, OUTS))
-    assert "must be a table" in wrong("losses")
+    assert "must be a table" in list_faults("losses")
     with pytest.raises(RecipeError, match="must be"):
         read_figures("mine.toml", {"figure": 3})
     assert "title: must be a text" in "".join(iter_faults({"title": 3}, OUTS))

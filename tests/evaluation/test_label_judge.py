@@ -1,4 +1,4 @@
-"""The label benchmark: its faults change the named signals, and its figures are right."""
+"""The label benchmark: injected faults change the named signals, and figures are correct."""
 
 from pathlib import Path
 
@@ -57,7 +57,7 @@ def test_figures_of_a_flight_count_every_position(tmp_path: Path) -> None:
             at = 1_000_000_000 + k * 50_000_000
             sink.write(at, topics.TRUTH("cf1", "cf2"), made(x=1.0, y=0.5))
             covariance = np.diag([0.04, 0.04, 1.0]).ravel().tolist()
-            # Twenty are kept, of which five are 0.4 m off; the others are 0.6 m off.
+            # Twenty positions are kept, five of them with an error of 0.4 m; the rest have 0.6 m.
             status = STATUS_OK if k < 20 else STATUS_UNCONVERGED
             error = 0.0 if k < 15 else 0.4 if k < 20 else 0.6
             found = made(x=1.0 + error, y=0.5, covariance=covariance, status=status)

@@ -1,4 +1,4 @@
-"""The bound of a simulated flight in the output of `evaluate`."""
+"""The Cramer-Rao bound of a simulated flight in the output of `evaluate`."""
 
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -24,14 +24,14 @@ pytestmark = pytest.mark.heavy
 SETTINGS = FlySettings(duration_s=20.0, noise="harsh", seed=4)
 
 
-def _record(
+def _write_flight(
     path: Path,
     settings: dict[str, Any] | None = None,
     *,
     part_s: tuple[float, float] = (0.0, 20.0),
     shift_m: float = 0.0,
 ) -> Path:
-    """Truth and estimates of a flight, as a label of what `dmrl fly` made."""
+    """Write truth and estimates of a flight, with the provenance of `dmrl label` of `dmrl fly`."""
     settings = asdict(SETTINGS) if settings is None else settings
     made = Provenance("label", inputs=(Input("a.mcap", "0" * 64, Provenance("fly", settings)),))
     flight = simulate(Scenario(duration_s=20.0), NOISE["harsh"], 4)
@@ -51,14 +51,14 @@ def _record(
     return path
 
 
-def _limit(path: Path, settle_s: float = 10.0) -> Any:
+def _compute_limit(path: Path, settle_s: float = 10.0) -> Any:
     return document(path, judge(path), settle_s)["limit"]
 
 
 def test_evaluate_reports_the_bound_of_a_smoother(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    path = _record(tmp_path / "a.mcap")
+    path = _write_flight(tmp_path / "a.mcap")
     made = document(path, judge(path), 10.0)
     flight = simulate(Scenario(duration_s=20.0), NOISE["harsh"], 4)
     bound = compute_bound(flight, NOISE["harsh"])
@@ -94,9 +94,9 @@ def test_bound_of_the_kept_share_assumes_gaussian_errors() -> None:
     assert made["rmse_m"] == pytest.approx(np.sqrt((sigma**2).sum(axis=1).mean()))
 
 
-def test_a_part_of_a_flight_has_the_limit_of_its_ranges(tmp_path: Path) -> None:
-    whole = _limit(_record(tmp_path / "whole.mcap"), 0.0)
-    part = _limit(_record(tmp_path / "part.mcap", part_s=(8.0, 13.0)), 0.0)
+def test_a_part_of_a_flight_has_the_bound_of_its_own_ranges(tmp_path: Path) -> None:
+    whole = _compute_limit(_write_flight(tmp_path / "whole.mcap"), 0.0)
+    part = _compute_limit(_write_flight(tmp_path / "part.mcap", part_s=(8.0, 13.0)), 0.0)
     assert part["rmse_m"] > 1.2 * whole["rmse_m"]
 
 
@@ -116,13 +116,13 @@ def test_a_part_of_a_flight_has_the_limit_of_its_ranges(tmp_path: Path) -> None:
 def test_flight_without_simulation_settings_has_no_bound(
     tmp_path: Path, settings: dict[str, Any]
 ) -> None:
-    assert _limit(_record(tmp_path / "a.mcap", settings)) is None
+    assert _compute_limit(_write_flight(tmp_path / "a.mcap", settings)) is None
 
 
 def test_flight_simulated_by_another_version_has_no_bound_and_warns(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert _limit(_record(tmp_path / "moved.mcap", shift_m=0.01)) is None
+    assert _compute_limit(_write_flight(tmp_path / "moved.mcap", shift_m=0.01)) is None
     assert "simulates the flight otherwise" in capsys.readouterr().err
     other = asdict(replace(SETTINGS, seed=5))
-    assert _limit(_record(tmp_path / "other.mcap", other)) is None
+    assert _compute_limit(_write_flight(tmp_path / "other.mcap", other)) is None

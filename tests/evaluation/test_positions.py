@@ -1,4 +1,4 @@
-"""Estimated positions against the truth: axes, covariances, and missing estimates."""
+"""Estimated positions are compared with the truth: axes, covariances, missing estimates."""
 
 from pathlib import Path
 
@@ -17,7 +17,7 @@ def test_each_axis_is_compared_with_the_same_axis_of_truth(tmp_path: Path) -> No
     path = tmp_path / "a.mcap"
     made = message_class("PeerPosition")
     with RecordingWriter(path, Provenance("test")) as sink:
-        for k in range(21):  # two seconds of truth; estimates from 0.5 s on, between its samples
+        for k in range(21):  # truth for 2 s; estimates from 0.5 s, halfway between its samples
             truth = made(x=1 + 0.1 * k, y=-2 + 0.3 * k, z=5.0)
             sink.write(k * 100_000_000, topics.TRUTH("cf1", "cf2"), truth)
             if k >= 5:

@@ -1,4 +1,4 @@
-"""The bound against a closed form, and against a smoother that knows the noise."""
+"""The bound equals a closed form, and a smoother that knows the noise reaches it."""
 
 from dataclasses import replace
 
@@ -14,16 +14,19 @@ from dmrl.geometry.frames import Array
 LINK = ("cf1", "cf2")
 
 
-def _still(place_m: tuple[float, float, float], time_s: Array) -> Truth:
+def _build_still_truth(place_m: tuple[float, float, float], time_s: Array) -> Truth:
     none = np.zeros(len(time_s))
     place = np.tile(np.array(place_m), (len(time_s), 1))
     return Truth(time_s, place, np.zeros((len(time_s), 3)), none, none, none)
 
 
-def _still_flight(duration_s: float, rate_hz: float) -> Flight:
-    """Two robots at rest, 2 m apart along x, with ranges of one direction."""
+def _build_still_flight(duration_s: float, rate_hz: float) -> Flight:
+    """Return a flight of two robots at rest, 2 m apart along x, with ranges of one direction."""
     time_s = np.arange(round(100 * duration_s) + 1) / 100
-    truth = {"cf1": _still((0, 0, 1), time_s), "cf2": _still((2, 0, 1), time_s)}
+    truth = {
+        "cf1": _build_still_truth((0, 0, 1), time_s),
+        "cf2": _build_still_truth((2, 0, 1), time_s),
+    }
     ranged = np.arange(0.001, duration_s, 1 / rate_hz)
     ranges = {LINK: Ranges(ranged, ranged), LINK[::-1]: Ranges(np.empty(0), np.empty(0))}
     return Flight(dict.fromkeys(truth), truth, ranges, dict.fromkeys(truth, Clock()))  # type: ignore[arg-type]
@@ -31,22 +34,24 @@ def _still_flight(duration_s: float, rate_hz: float) -> Flight:
 
 def test_bound_of_a_random_walk_in_white_noise_equals_closed_form() -> None:
     noise = Noise(uwb_white_m=0.1, velocity_white_mps=0.3)
-    bound = compute_bound(_still_flight(40.0, 50.0), noise, yaw_spread_rad=0.0)
+    bound = compute_bound(_build_still_flight(40.0, 50.0), noise, yaw_spread_rad=0.0)
     step_s = 0.2
     walk, measured = 2 * 0.3**2 * step_s / 100, 0.1**2 / (50 * step_s)
-    # Riccati's fixed point, then one filter from each side and a step between them.
+    # Fixed point of the Riccati equation, then forward and backward filter combined.
     predicted = (walk + np.sqrt(walk**2 + 4 * walk * measured)) / 2
     filtered = predicted * measured / (predicted + measured)
     smoothed = 1 / (1 / filtered + 1 / predicted)
     middle = bound.interpolate_at(LINK, np.array([20.0]))[0]
     assert middle[0, 0] == pytest.approx(smoothed, rel=0.01)
-    # Across the ranges, nothing tells but the start and the walk from it.
+    # Across the line of sight only the prior at the start and the random walk matter.
     assert middle[1, 1] == pytest.approx(1.5**2 + 2 * 0.3**2 * 20.0 / 100, rel=0.01)
 
 
 def test_range_bias_and_scale_limit_the_bound_of_many_ranges() -> None:
     noise = Noise(uwb_white_m=0.1, uwb_bias_m=0.05, uwb_scale=0.02, velocity_white_mps=1e-3)
-    place = compute_bound(_still_flight(40.0, 50.0), noise, 0.0).interpolate_at(LINK, np.zeros(1))
+    place = compute_bound(_build_still_flight(40.0, 50.0), noise, 0.0).interpolate_at(
+        LINK, np.zeros(1)
+    )
     constants = 0.05**2 + (2 * 0.02) ** 2 + 0.1**2 / 2000
     assert place[0, 0, 0] == pytest.approx(1 / (1 / constants + 1 / 1.5**2), rel=0.02)
 
@@ -54,10 +59,10 @@ def test_range_bias_and_scale_limit_the_bound_of_many_ranges() -> None:
 def test_information_of_a_range_has_its_whole_density() -> None:
     white = Noise(uwb_white_m=0.1)
     assert compute_range_information(white) == pytest.approx(100.0, rel=1e-4)
-    # Detours far longer than the noise stand apart: what is left is told as well as ever.
+    # Detours far longer than the noise are outliers; the remaining 80 % keep their information.
     apart = replace(white, nlos_share=0.2, nlos_mean_m=5.0)
     assert 75.0 < compute_range_information(apart) < 80.0
-    # Detours far shorter than the noise change its mean alone.
+    # Detours far shorter than the noise only change its mean.
     short = replace(white, nlos_share=0.2, nlos_mean_m=0.002)
     assert compute_range_information(short) == pytest.approx(100.0, rel=0.01)
 
@@ -108,7 +113,7 @@ def test_optimal_smoother_reaches_the_bound() -> None:
             bounds.append(np.trace(covariance, axis1=1, axis2=2))
             distances.append(np.einsum("ka,kab,kb->k", error, np.linalg.inv(covariance), error))
     ratio = np.sqrt(np.mean(squared) / np.mean(bounds))
-    # Errors of a flight are correlated: 24 flights tell the ratio to about a tenth.
+    # Errors within a flight are correlated, so 24 flights determine the ratio to about 10 %.
     assert 0.85 < ratio < 1.15
     assert 1.6 < np.mean(distances) < 2.5
 
@@ -117,10 +122,10 @@ FLIGHTS, KEY_S, ROUNDS = 24, 0.1, 8
 
 
 class _Smoother:
-    """Maximum a posteriori of poses, coloured errors and constants, from the true ones on.
+    """Maximum a posteriori solve of poses, coloured errors and constants, started at the truth.
 
-    Its residuals come from the logs by a model of their own, and its derivatives are numerical:
-    it shares nothing with the bound but the noise.
+    It has its own model of the logs and numerical derivatives, so that it shares only the noise
+    parameters with the bound.
     """
 
     def __init__(self, flight: Flight, noise: Noise) -> None:
@@ -152,7 +157,7 @@ class _Smoother:
             np.interp(time_s, log.time_s, np.convolve(log.height_m, np.ones(51) / 51, "same"))
             for log in flight.robots.values()
         ]
-        # The smoothed heights of the ends are low: there the true ones and the bias count.
+        # Smoothing biases the heights at both ends, so there true heights plus bias are used.
         ends = (time_s < 0.5) | (time_s > self.key_s[-1] - 0.5)
         for k, log in enumerate(flight.robots.values()):
             bias = float(np.mean(log.height_m - truths[k].position[:, 2]))
@@ -161,7 +166,7 @@ class _Smoother:
         self._tabulate_density()
 
     def _integrate(self, flight: Flight, name: str) -> tuple[Array, Array, Array]:
-        """Turn, displacement and effect of a bias in the frame of each step's start."""
+        """Return turn, displacement and effect of a velocity bias per step, frame of its start."""
         log, each = flight.robots[name], round(100 * KEY_S)
         turn = np.concatenate([[0.0], np.cumsum(log.yaw_rate_radps[:-1] + log.yaw_rate_radps[1:])])
         turn /= 200
@@ -176,7 +181,7 @@ class _Smoother:
         return angle[:, -1], moved @ weights, bias
 
     def _tabulate_density(self) -> None:
-        """The signed root of a range's cost, by error: its square is the exact log-likelihood."""
+        """Tabulate residuals of range errors whose squares are twice the exact cost."""
         n = self.noise
         step = 0.001
         error = np.arange(-2.0, 6.0, step)
@@ -211,7 +216,7 @@ class _Smoother:
             away = np.stack([np.diff(x), np.diff(y)], axis=1)
             c, si = np.cos(yaw[:-1]), np.sin(yaw[:-1])
             away = np.stack([c * away[:, 0] + si * away[:, 1], c * away[:, 1] - si * away[:, 0]], 1)
-            lack = body - (1 + n.velocity_scale * scale) * away  # the error's integral
+            lack = body - (1 + n.velocity_scale * scale) * away  # integral of the velocity error
             lack = np.einsum("bak,kb->ka", rotation, lack) - s * tau * (1 - keep) * slow[:-1]
             fresh = slow[1:] - keep * slow[:-1]
             found += list(whiten @ np.stack([lack[:, 0], fresh[:, 0]]))
@@ -241,7 +246,8 @@ class _Smoother:
             entries = []
             for part in range(3):
                 mine = np.arange(self.count) % 3 == part
-                # A residual sees its step and the next; of three steps one is moved at a time.
+                # A residual depends on two successive steps, so every third step can be
+                # perturbed at once.
                 seen = np.where(
                     where % 3 == part, where, np.where((where + 1) % 3 == part, where + 1, -1)
                 )
@@ -268,6 +274,6 @@ class _Smoother:
 
 
 def _nonzero(effect: Array, column: Array) -> tuple[Array, Array, Array]:
-    """Rows, columns and values of a derivative's entries."""
+    """Return rows, columns and values of the non-zero derivatives."""
     used = np.flatnonzero((column >= 0) & (effect != 0))
     return used, column[used], effect[used]

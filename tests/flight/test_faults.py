@@ -1,4 +1,4 @@
-"""Simulated faults: each has its stated effect only."""
+"""Simulated faults have their stated effect and no other."""
 
 from dataclasses import replace
 from typing import Any, get_args
@@ -13,16 +13,16 @@ from dmrl.flight.faults import FaultKind
 SHORT = Scenario(3, 15.0, "random")
 PLAIN = simulate(SHORT, NOISE["harsh"], 5)
 WINDOWS = {"range_gap": 5.0}
-"""Seconds, where what is usual does not fit."""
+"""Duration of a fault whose default is too long for the flight, seconds."""
 COLUMNS = [name for name in RobotLog.__slots__ if name != "time_s"]
 
 
-def flown(*faults: Fault) -> Flight:
+def simulate_with(*faults: Fault) -> Flight:
     return simulate(SHORT, NOISE["harsh"], 5, faults)
 
 
-def changed(flight: Flight) -> dict[str, np.ndarray]:
-    """Seconds of true time at which a log, or the ranges, differ from the flight's without it."""
+def find_changes(flight: Flight) -> dict[str, np.ndarray]:
+    """Return by signal the true times, seconds, at which it differs from the flight without it."""
     found = {}
     for robot, log in flight.robots.items():
         for name in COLUMNS:
@@ -57,7 +57,7 @@ def test_a_fault_changes_its_own_sensor_in_its_window_alone(
     kind: FaultKind, names: set[str]
 ) -> None:
     peer = "cf2" if "cf1-cf2" in names else ""
-    found = changed(flown(Fault(kind, "cf1", peer, start_s=6.0, duration_s=4.0)))
+    found = find_changes(simulate_with(Fault(kind, "cf1", peer, start_s=6.0, duration_s=4.0)))
     assert set(found) == names
     for times in found.values():
         assert times.min() >= 6.0 - 1e-9 and times.max() < 10.0 + 1e-9
@@ -72,33 +72,44 @@ def test_a_fault_changes_its_own_sensor_in_its_window_alone(
     ],
 )
 def test_additive_fault_has_its_size(fault: Fault, column: str, added: float) -> None:
-    log, before = (f.robots["cf2"] for f in (flown(fault), PLAIN))
+    log, before = (f.robots["cf2"] for f in (simulate_with(fault), PLAIN))
     assert np.allclose(getattr(log, column) - getattr(before, column), added)
 
 
 def test_gap_faults_give_nan_and_stuck_faults_zero() -> None:
-    stuck = flown(Fault("velocity_stuck", "cf1", start_s=5.0)).robots["cf1"].vx_mps[500:1500]
-    silent = flown(Fault("velocity_gap", "cf1", start_s=5.0)).robots["cf1"].vx_mps[500:1000]
+    stuck = (
+        simulate_with(Fault("velocity_stuck", "cf1", start_s=5.0)).robots["cf1"].vx_mps[500:1500]
+    )
+    silent = simulate_with(Fault("velocity_gap", "cf1", start_s=5.0)).robots["cf1"].vx_mps[500:1000]
     assert not stuck.any() and np.isnan(silent).all()
-    scaled = flown(Fault("velocity_scale", "cf1", size=0.2)).robots["cf1"].vx_mps
+    scaled = simulate_with(Fault("velocity_scale", "cf1", size=0.2)).robots["cf1"].vx_mps
     assert np.allclose(scaled, 1.2 * PLAIN.robots["cf1"].vx_mps)
 
 
 def test_ranges_are_longer_by_the_size_and_outliers_are_a_share() -> None:
     before = PLAIN.ranges["cf2", "cf1"].range_m
-    longer = flown(Fault("range_offset", "cf1", "cf2", size=0.5)).ranges["cf2", "cf1"].range_m
+    longer = (
+        simulate_with(Fault("range_offset", "cf1", "cf2", size=0.5)).ranges["cf2", "cf1"].range_m
+    )
     assert np.allclose(longer - before, 0.5)
-    off = flown(Fault("range_outliers", "cf1", "cf2", size=0.3)).ranges["cf2", "cf1"].range_m
+    off = (
+        simulate_with(Fault("range_outliers", "cf1", "cf2", size=0.3)).ranges["cf2", "cf1"].range_m
+    )
     assert (off != before).mean() == pytest.approx(0.3, abs=0.05)
     assert (off - before).max() <= 3.0 and off.min() >= 0.01
 
 
 def test_range_fault_without_peer_affects_all_links_of_the_robot() -> None:
-    assert set(changed(flown(Fault("nlos", "cf2")))) == {"cf1-cf2", "cf2-cf1", "cf2-cf3", "cf3-cf2"}
+    assert set(find_changes(simulate_with(Fault("nlos", "cf2")))) == {
+        "cf1-cf2",
+        "cf2-cf1",
+        "cf2-cf3",
+        "cf3-cf2",
+    }
 
 
 def test_fault_windows_are_spread_evenly_over_the_flight() -> None:
-    (event,) = flown(Fault("nlos", "cf1", duration_s=2.0, number=5)).faults
+    (event,) = simulate_with(Fault("nlos", "cf1", duration_s=2.0, number=5)).faults
     start, end = event.windows_s.T
     assert np.allclose(end - start, 2.0)
     assert np.array_equal((start // 3).astype(int), np.arange(5))
@@ -107,18 +118,18 @@ def test_fault_windows_are_spread_evenly_over_the_flight() -> None:
 
 def test_clock_fault_changes_times_only() -> None:
     wrong = Fault("clock_drift", "cf2", size=200.0), Fault("clock_offset", "cf2", size=0.1)
-    flight = flown(*wrong)
+    flight = simulate_with(*wrong)
     clock, before = flight.clocks["cf2"], PLAIN.clocks["cf2"]
     assert clock == Clock(before.offset_s + 0.1, before.drift + 2e-4)
     assert np.allclose(flight.robots["cf2"].time_s, clock.to_clock_time(flight.truth["cf2"].time_s))
     true_s = clock.to_true_time(flight.ranges["cf2", "cf1"].time_s)
     assert np.allclose(true_s, before.to_true_time(PLAIN.ranges["cf2", "cf1"].time_s))
-    assert not changed(replace(flight, ranges=PLAIN.ranges))
+    assert not find_changes(replace(flight, ranges=PLAIN.ranges))
 
 
 @pytest.mark.parametrize("kind", ["landing", "crash"])
 def test_crashed_robot_falls_and_stays_on_the_floor(kind: FaultKind) -> None:
-    flight = flown(Fault(kind, "cf3", start_s=8.0))
+    flight = simulate_with(Fault(kind, "cf3", start_s=8.0))
     truth, before = flight.truth["cf3"], PLAIN.truth["cf3"]
     assert np.array_equal(truth.position[:800], before.position[:800])
     assert truth.position[-1, 2] == pytest.approx(0.02)
@@ -134,7 +145,7 @@ def test_crashed_robot_falls_and_stays_on_the_floor(kind: FaultKind) -> None:
 
 
 def test_velocity_estimate_of_a_crashed_robot_diverges() -> None:
-    log = flown(Fault("crash", "cf1", start_s=5.0, size=9.0)).robots["cf1"]
+    log = simulate_with(Fault("crash", "cf1", start_s=5.0, size=9.0)).robots["cf1"]
     assert np.hypot(log.vx_mps[-50:], log.vy_mps[-50:]).mean() == pytest.approx(8.9, abs=0.4)
     assert np.array_equal(log.vx_mps[:500], PLAIN.robots["cf1"].vx_mps[:500])
 
@@ -156,7 +167,7 @@ def test_velocity_estimate_of_a_crashed_robot_diverges() -> None:
         ({"kind": "clock_drift", "start_s": 1.0}, "whole flight"),
     ],
 )
-def test_faults_that_make_no_sense_are_refused(given: dict[str, Any], why: str) -> None:
+def test_inconsistent_faults_are_refused(given: dict[str, Any], why: str) -> None:
     with pytest.raises(ValueError) as caught:
         Fault(robot="cf1", **given)
     assert why in str(caught.value)
@@ -174,13 +185,13 @@ def test_faults_that_make_no_sense_are_refused(given: dict[str, Any], why: str) 
 )
 def test_faults_that_do_not_fit_the_flight_are_refused(fault: Fault, why: str) -> None:
     with pytest.raises(SettingError, match=why):
-        flown(fault)
+        simulate_with(fault)
 
 
 @pytest.mark.parametrize("kind", get_args(FaultKind))
 def test_every_fault_kind_has_an_effect_and_is_reproducible(kind: FaultKind) -> None:
-    one, same = (flown(Fault(kind, "cf2", duration_s=WINDOWS.get(kind))) for _ in range(2))
-    assert one.clocks != PLAIN.clocks or changed(one)
+    one, same = (simulate_with(Fault(kind, "cf2", duration_s=WINDOWS.get(kind))) for _ in range(2))
+    assert one.clocks != PLAIN.clocks or find_changes(one)
     for name in COLUMNS:
         assert np.array_equal(
             getattr(one.robots["cf2"], name), getattr(same.robots["cf2"], name), equal_nan=True

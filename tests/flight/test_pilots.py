@@ -1,4 +1,4 @@
-"""Pilots without a simulation: their commands for given observations."""
+"""Commands of pilots for given observations, without a simulation."""
 
 from dataclasses import replace
 
@@ -14,7 +14,7 @@ TASK = Task("cf1", leader="cf2", distance_m=0.7)
 Places = list[tuple[float, float]]
 
 
-def track(x: float, y: float) -> PeerTrack:
+def build_track(x: float, y: float) -> PeerTrack:
     place = np.array([x, y, 0.0])
     return PeerTrack(1, "cf2", place, np.zeros(3), 0.0025 * np.eye(3), 0.1)
 
@@ -22,7 +22,7 @@ def track(x: float, y: float) -> PeerTrack:
 def observe(
     time_s: float, places: Places, confidence: float = 0.95, image_age_s: float = 0.0
 ) -> Observation:
-    """What a level robot at rest sees of peers at its height."""
+    """Return the observation of a level robot at rest with peers at its height."""
     camera = AIDECK_PINHOLE
     found = tuple(
         (camera.cx_px - camera.fx_px * y / x, camera.cy_px, x, confidence) for x, y in places
@@ -32,7 +32,7 @@ def observe(
 
 
 def fly(pilot: Pilot, places: Places, first: int = 0, steps: int = 10) -> list[Command]:
-    """Show a pilot the same peers ten times a second."""
+    """Show a pilot the same peers ten times per second; return its commands."""
     return [pilot.command(observe(0.1 * (first + k), places)) for k in range(steps)]
 
 
@@ -51,7 +51,7 @@ def test_pilot_slows_down_while_detections_are_missing() -> None:
     assert before - speeds[-1] > 0.1
 
 
-def test_it_stops_and_turns_to_where_the_leader_was_heading() -> None:
+def test_without_detections_it_stops_and_turns_to_the_side_of_the_leader() -> None:
     for side in (1.0, -1.0):
         pilot = Follow(TASK)
         for k in range(10):
@@ -63,8 +63,8 @@ def test_it_stops_and_turns_to_where_the_leader_was_heading() -> None:
 
 
 @pytest.mark.parametrize("apparent_m", [0.3, 1.0])
-def test_pilot_does_not_fly_off_with_a_spot_in_the_image(apparent_m: float) -> None:
-    """A spot that a network takes for a peer keeps its apparent distance, wherever one flies."""
+def test_pilot_does_not_follow_a_spot_in_the_image(apparent_m: float) -> None:
+    """A spot that the network takes for a peer keeps its apparent distance during all motion."""
     pilot, way_m, vx_mps = Follow(TASK), 0.0, 0.0
     fly(pilot, [(0.7, 0.0)])
     for k in range(200):
@@ -76,7 +76,7 @@ def test_pilot_does_not_fly_off_with_a_spot_in_the_image(apparent_m: float) -> N
 
 
 @pytest.mark.parametrize(("v_px", "depth_m"), [(200.0, 0.25), (30.0, 0.25)])
-def test_weak_spots_above_or_below_the_leader_are_not_its(v_px: float, depth_m: float) -> None:
+def test_weak_detections_above_or_below_the_leader_are_ignored(v_px: float, depth_m: float) -> None:
     pilot, way_m, vx_mps = Follow(TASK), 0.0, 0.0
     fly(pilot, [(0.7, 0.0)])
     spot = (AIDECK_PINHOLE.cx_px, v_px, depth_m, 0.15)
@@ -89,7 +89,7 @@ def test_weak_spots_above_or_below_the_leader_are_not_its(v_px: float, depth_m: 
 
 
 def test_pilot_leaves_a_weak_spot_for_a_sure_leader_elsewhere() -> None:
-    """A weak false object that stays where the leader is expected does not hide the leader."""
+    """A weak false detection at the expected position does not hide the leader."""
     pilot = Follow(TASK)
     fly(pilot, [(0.7, 0.0)])
     commands = []
@@ -100,12 +100,12 @@ def test_pilot_leaves_a_weak_spot_for_a_sure_leader_elsewhere() -> None:
         )
         seen = replace(observe(1.0 + 0.1 * k, []), detections=(*leader, *spot))
         commands.append(pilot.command(seen))
-    assert abs(commands[0].yaw_rate_radps) < 0.2  # one image is not enough
+    assert abs(commands[0].yaw_rate_radps) < 0.2  # a single image is not enough
     assert commands[-1].yaw_rate_radps < -0.5 and commands[-1].vx_mps > 0.2
 
 
-def test_a_leader_that_is_only_missed_stays_in_view_for_seconds() -> None:
-    """A network that sees nothing of a leader ahead must not turn away from it."""
+def test_pilot_does_not_turn_away_while_detections_are_missing() -> None:
+    """The network may miss a leader that is still ahead, so it stays in view for 2.5 s."""
     pilot, yaw_rad, rate = Follow(TASK), 0.0, 0.0
     fly(pilot, [(0.7, 0.0)])
     yaws = []
@@ -130,7 +130,7 @@ def test_every_pilot_moves_away_from_a_peer_that_is_too_near() -> None:
         for k in range(10):
             seen = observe(0.1 * k, [(0.3, 0.0)])
             seen = Observation(
-                seen.time_s, 0.0, 0.0, 0.0, np.zeros(2), 1.0, {}, (track(0.3, 0.0),), 0.0,
+                seen.time_s, 0.0, 0.0, 0.0, np.zeros(2), 1.0, {}, (build_track(0.3, 0.0),), 0.0,
                 seen.detections,
             )  # fmt: skip
             command = pilot.command(seen)
@@ -142,7 +142,7 @@ def test_a_place_in_a_formation_does_not_turn_with_the_robot() -> None:
     pilot = Formation(TASK)
     straight = fly(pilot, [(0.7, 0.0)])[-1]
     assert np.hypot(straight.vx_mps, straight.vy_mps) < 0.1 and straight.vz_mps > 0.05
-    # The robot has turned by a right angle to the left: its place is behind the leader as before.
+    # The robot has turned left by 90 degrees, but its place is still behind the leader.
     turned = Formation(TASK)
     for k in range(11):
         rate = 10 * np.pi / 2 / 10

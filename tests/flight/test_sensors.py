@@ -1,4 +1,4 @@
-"""Simulated noise against the noise table."""
+"""Simulated noise matches the noise table."""
 
 from dataclasses import fields
 from functools import cache
@@ -16,21 +16,21 @@ FLIGHTS = 60
 
 
 @cache
-def ideal_flight(scenario: Scenario, seed: int) -> Flight:
-    """The twin of a flight, the same for every preset."""
+def simulate_ideal(scenario: Scenario, seed: int) -> Flight:
+    """Simulate the same flight with ideal sensors, once for all presets."""
     return simulate(scenario, NOISE["ideal"], seed)
 
 
 @pytest.fixture(scope="module", params=PRESETS)
 def preset(request: pytest.FixtureRequest) -> tuple[Noise, list[tuple[Flight, Flight]]]:
-    """Sixty short flights of three robots with a preset, each beside its ideal twin."""
+    """Return a noise preset and sixty short flights, each with its twin with ideal sensors."""
     noise, scenario = NOISE[request.param], Scenario(robots=3, duration_s=15.0)
-    pairs = [(simulate(scenario, noise, k), ideal_flight(scenario, k)) for k in range(FLIGHTS)]
+    pairs = [(simulate(scenario, noise, k), simulate_ideal(scenario, k)) for k in range(FLIGHTS)]
     return noise, pairs
 
 
-def errors(pairs: list[tuple[Flight, Flight]], name: str) -> Array:
-    """(flights x robots, samples) measured less ideal."""
+def compute_errors(pairs: list[tuple[Flight, Flight]], name: str) -> Array:
+    """Return (flights x robots, samples) errors of a column: measured minus ideal."""
     return np.array(
         [
             getattr(noisy.robots[r], name) - getattr(ideal.robots[r], name)
@@ -57,9 +57,9 @@ def test_white_noise_and_bias_match_the_noise_table(
     preset: Preset, column: str, white: str, bias: str
 ) -> None:
     noise, pairs = preset
-    error = errors(pairs, column)
+    error = compute_errors(pairs, column)
     assert error.std(axis=1).mean() == pytest.approx(getattr(noise, white), rel=0.02)
-    # 180 draws: one standard error of a standard deviation is 5 %.
+    # With 180 draws the standard error of a standard deviation is 5 %.
     assert error.mean(axis=1).std() == pytest.approx(getattr(noise, bias), rel=0.2)
 
 
@@ -67,8 +67,8 @@ def test_white_noise_and_bias_match_the_noise_table(
 def test_velocity_noise_is_white_and_coloured(preset: Preset) -> None:
     noise, pairs = preset
     ideal = np.concatenate([[i.robots[r].vx_mps for r in i.robots] for _, i in pairs])
-    error = errors(pairs, "vx_mps")
-    # Per flight, the part that follows the true velocity is the scale; the mean is the bias.
+    error = compute_errors(pairs, "vx_mps")
+    # In each flight, the part proportional to the true velocity is the scale; the mean is the bias.
     centred, moved = error - error.mean(axis=1, keepdims=True), ideal - ideal.mean(axis=1)[:, None]
     scale = (centred * moved).sum(axis=1) / (moved**2).sum(axis=1)
     rest = centred - scale[:, None] * moved
@@ -87,11 +87,11 @@ def test_velocity_scale_and_bias_match_the_noise_table(name: str) -> None:
     )
     scenario, drawn = Scenario(robots=6, duration_s=3.0, trajectory="random"), []
     for seed in range(60):
-        noisy, ideal = simulate(scenario, constant, seed), ideal_flight(scenario, seed)
+        noisy, ideal = simulate(scenario, constant, seed), simulate_ideal(scenario, seed)
         for robot, log in noisy.robots.items():
             scale, bias = np.polyfit(ideal.robots[robot].vx_mps, log.vx_mps, 1)
             other, _ = np.polyfit(ideal.robots[robot].vy_mps, log.vy_mps, 1)
-            assert other == pytest.approx(scale)  # one lens, one scale
+            assert other == pytest.approx(scale)  # both axes have the same scale
             drawn.append((scale, bias))
     scale, bias = np.array(drawn).T
     assert scale.std() == pytest.approx(preset.velocity_scale, rel=0.12)
@@ -110,14 +110,14 @@ def test_coloured_noise_is_stationary_with_exponential_correlation() -> None:
     assert fading == pytest.approx(np.exp(-1.0), abs=0.1)
 
 
-def range_errors(flight: Flight) -> tuple[Array, int]:
-    """Measured less true for every range, and how many ranges there would be without loss."""
+def compute_range_errors(flight: Flight) -> Array:
+    """Return the error of every range of a flight, metres."""
     found = []
     for (here, peer), ranges in flight.ranges.items():
         time_s = flight.clocks[here].to_true_time(ranges.time_s)
         away = flight.peer_in_horizontal(here, peer, time_s)
         found.append(ranges.range_m - np.linalg.norm(away, axis=1))
-    return np.concatenate(found), len(flight.ranges)
+    return np.concatenate(found)
 
 
 @pytest.mark.heavy
@@ -125,15 +125,14 @@ def test_range_noise_matches_the_noise_table(preset: Preset) -> None:
     noise, pairs = preset
     every, whites = [], []
     for noisy, _ in pairs:
-        error, _ = range_errors(noisy)
-        every.append(error)
+        every.append(compute_range_errors(noisy))
         for (here, peer), ranges in noisy.ranges.items():
             time_s = noisy.clocks[here].to_true_time(ranges.time_s)
             true = np.linalg.norm(noisy.peer_in_horizontal(here, peer, time_s), axis=1)
             slope, offset = np.polyfit(true, ranges.range_m, 1)
             rest = ranges.range_m - slope * true - offset
             low = rest - np.median(rest)
-            whites.append(np.sqrt(np.mean(low[low < 0] ** 2)))  # no detour makes a range short
+            whites.append(np.sqrt(np.mean(low[low < 0] ** 2)))  # detours only make ranges longer
     assert np.mean(whites) == pytest.approx(noise.uwb_white_m, rel=0.15)
     mean = noise.nlos_share * noise.nlos_mean_m
     spread = 3 * noise.uwb_bias_m / np.sqrt(3 * FLIGHTS) + 0.01
@@ -170,7 +169,7 @@ def test_range_bias_is_equal_in_both_directions() -> None:
 def test_ideal_sensors_have_no_noise() -> None:
     flight = simulate(Scenario(duration_s=5.0), NOISE["ideal"], 0)
     assert len(flight.ranges["cf1", "cf2"].time_s) == 250
-    assert np.abs(range_errors(flight)[0]).max() < 1e-3
+    assert np.abs(compute_range_errors(flight)).max() < 1e-3
 
 
 def test_presets_are_ordered_in_every_noise_parameter() -> None:

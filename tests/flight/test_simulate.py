@@ -31,7 +31,7 @@ def test_an_ideal_robot_measures_the_truth_in_its_own_frame(kind: Trajectory) ->
         assert np.allclose(turned, truth.yaw[1:] - truth.yaw[0])
 
 
-def test_thrust_points_where_the_acceleration_does() -> None:
+def test_thrust_is_along_acceleration_minus_gravity() -> None:
     truth = simulate(replace(SHORT, trajectory="random"), IDEAL, 3).truth["cf1"]
     pull = np.gradient(truth.velocity, 0.01, axis=0) + np.array([0.0, 0.0, GRAVITY_MPS2])
     for k in (500, 1234, 2500):
@@ -44,13 +44,13 @@ def test_thrust_points_where_the_acceleration_does() -> None:
 
 def test_a_robot_that_speeds_up_pitches_its_nose_down() -> None:
     truth = simulate(replace(SHORT, trajectory="no_yaw"), IDEAL, 1).truth["cf1"]
-    forward = np.gradient(truth.velocity[:, 0], 0.01)  # its yaw is 0
+    forward = np.gradient(truth.velocity[:, 0], 0.01)  # forward is x, since the yaw is 0
     assert np.corrcoef(forward, truth.pitch)[0, 1] > 0.99
     left = np.gradient(truth.velocity[:, 1], 0.01)
     assert np.corrcoef(left, truth.roll)[0, 1] < -0.99
 
 
-def test_the_peer_is_where_the_observer_would_see_it() -> None:
+def test_relative_position_has_true_distance_and_bearing() -> None:
     flight = simulate(SHORT, IDEAL, 4)
     time_s = flight.truth["cf1"].time_s
     xyz = flight.peer_in_horizontal("cf1", "cf2", time_s)

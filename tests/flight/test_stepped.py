@@ -1,4 +1,4 @@
-"""Stepped flights: specified dynamics, and the same measurements as whole flights."""
+"""Stepped flights have the specified dynamics, and the same measurements as whole flights."""
 
 from dataclasses import replace
 
@@ -28,7 +28,7 @@ def test_leader_flies_the_specified_figure_eight(seed: int) -> None:
     assert np.hypot(*truth.velocity[:, :2].T).max() <= 0.6 + 1e-9
     assert truth.position[:, 2].min() == pytest.approx(0.85, abs=0.01)
     assert truth.position[:, 2].max() == pytest.approx(1.15, abs=0.01)
-    # One round: the time between two passages through the origin in the same direction.
+    # One round is the time between two passages through the origin in the same direction.
     right = truth.position[:, 0] > 0
     crossings = np.flatnonzero(right[1:] & ~right[:-1]) / 100
     assert 18.0 <= np.diff(crossings).mean() <= 30.0
@@ -46,9 +46,9 @@ def test_follower_starts_behind_the_leader_and_faces_it(distance_m: float) -> No
 def test_commands_are_followed_with_lag_and_within_limits() -> None:
     truth = fly(Command(0.8, 0.0, 0.0, 0.0), 2.0).flight.truth["cf1"]
     speed = np.hypot(*truth.velocity[:, :2].T)
-    assert speed[25] == pytest.approx(0.8 * (1 - np.exp(-1)), abs=0.02)  # the lag: 0.25 s
+    assert speed[25] == pytest.approx(0.8 * (1 - np.exp(-1)), abs=0.02)  # the lag is 0.25 s
     turning = fly(Command(0.0, 0.0, 0.0, 1.0), 2.0)._flyers["cf1"].yaw_rate
-    assert turning[15] == pytest.approx(1 - np.exp(-1), abs=0.03)  # 0.15 s
+    assert turning[15] == pytest.approx(1 - np.exp(-1), abs=0.03)  # the lag is 0.15 s
     fast = fly(Command(5.0, 5.0, 5.0, 9.0), 5.0)
     assert np.hypot(*fast.flight.truth["cf1"].velocity[:501, :2].T).max() <= 1.0 + 1e-9
     assert fast.flight.truth["cf1"].velocity[500, 2] == pytest.approx(0.4, abs=0.01)
@@ -61,11 +61,11 @@ def test_velocity_is_in_body_axes_and_acceleration_tilts_the_robot() -> None:
     assert log.vy_mps[100] == pytest.approx(0.5, abs=0.02)
     assert log.vx_mps[:101] == pytest.approx(0.0, abs=1e-9)
     truth = flight.flight.truth["cf1"]
-    assert truth.roll[5] < -0.02  # to the left: left side down
+    assert truth.roll[5] < -0.02  # it accelerates to the left, with the left side down
     assert truth.pitch[5] == pytest.approx(0.0, abs=1e-6)
 
 
-def test_the_steps_do_not_change_the_numbers() -> None:
+def test_a_flight_does_not_depend_on_the_size_of_its_steps() -> None:
     noise = NOISE["harsh"]
     faults = (Fault("velocity_gap", "cf2", start_s=1.0), Fault("nlos", "cf1", start_s=0.5))
     scenario = Scenario(3, 4.0, "in_view")

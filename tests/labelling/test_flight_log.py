@@ -1,4 +1,4 @@
-"""Topics of a recording as arrays."""
+"""Topics of a recording are read as arrays."""
 
 from pathlib import Path
 
@@ -15,7 +15,7 @@ SECOND_NS = 1_000_000_000
 
 @pytest.fixture
 def path(tmp_path: Path) -> Path:
-    """A message of several topics, at second 2 and later."""
+    """Write messages of several topics, one per second from 2 s."""
     rows = [
         (topics.ATTITUDE("a"), "Attitude", {"roll_rad": 1, "pitch_rad": 2, "yaw_rate_radps": 3}),
         (topics.VELOCITY("a"), "Velocity", {"vx_mps": 4, "vy_mps": 5}),

@@ -1,4 +1,4 @@
-"""Where peers truly are, from motion capture of both robots."""
+"""True positions of peers from motion capture of both robots."""
 
 from pathlib import Path
 
@@ -13,8 +13,8 @@ from dmrl.recording import Provenance, RecordingWriter
 PLACES = {"cf1": (1.0, 2.0, 0.5), "cf2": (1.0, 5.0, 0.9)}
 
 
-def captured(path: Path, lost: tuple[int, int] = (0, 0)) -> FlightLog:
-    """cf1 looks along y, so cf2 stands 3 m in front; cf2's markers are lost for a while."""
+def write_captured_flight(path: Path, lost: tuple[int, int] = (0, 0)) -> FlightLog:
+    """Write a recording with cf2 3 m in front of cf1; poses of cf2 are missing in a span."""
     turn = {"z": np.sin(np.pi / 4), "w": np.cos(np.pi / 4)}
     with RecordingWriter(path, Provenance("test")) as sink:
         for k in range(100):
@@ -28,7 +28,7 @@ def captured(path: Path, lost: tuple[int, int] = (0, 0)) -> FlightLog:
 
 
 def test_a_peer_is_where_the_robot_sees_it(tmp_path: Path) -> None:
-    held = captured(tmp_path / "a.mcap")
+    held = write_captured_flight(tmp_path / "a.mcap")
     assert list_true_pairs(held.topics) == [("cf1", "cf2"), ("cf2", "cf1")]
     time_ns, xyz = find_true_path(held, "cf1", "cf2")
     assert len(time_ns) == 100
@@ -38,7 +38,7 @@ def test_a_peer_is_where_the_robot_sees_it(tmp_path: Path) -> None:
 
 
 def test_true_path_omits_lost_markers(tmp_path: Path) -> None:
-    held = captured(tmp_path / "a.mcap", lost=(20, 60))
+    held = write_captured_flight(tmp_path / "a.mcap", lost=(20, 60))
     time_ns, _ = find_true_path(held, "cf1", "cf2")
     gone = (time_ns > 19 * 20_000_000) & (time_ns < 60 * 20_000_000)
     assert not gone.any() and len(time_ns) == 60

@@ -1,4 +1,4 @@
-"""Labels against drawings: where a peer is seen, how surely, and whether it is in view."""
+"""Labels in images: projection, sigmas, and whether a peer is in view."""
 
 from dataclasses import replace
 from typing import Any
@@ -22,7 +22,7 @@ SHARP = CameraOptions(attitude_std_rad=1e-9)
 EXACT = np.eye(3) * 1e-12
 
 
-def positions(
+def build_positions(
     *xyz_m: tuple[float, float, float], covariance: Array = EXACT, status: int = STATUS_OK
 ) -> PeerPositions:
     count = len(xyz_m)
@@ -34,7 +34,7 @@ def positions(
     )
 
 
-def labels(
+def build_labels(
     found: PeerPositions, look: CameraOptions = SHARP, camera: Camera = CAMERA, **tilt: float
 ) -> list[Any]:
     attitude = np.tile([tilt.get("roll", 0.0), tilt.get("pitch", 0.0)], (len(found.time_ns), 1))
@@ -44,7 +44,7 @@ def labels(
 @pytest.mark.parametrize("left", [0.6, -0.6])
 @pytest.mark.parametrize("up", [0.3, -0.5])
 def test_a_peer_is_seen_in_its_quarter_of_the_image(left: float, up: float) -> None:
-    (label,) = labels(positions((2.0, left, up)))
+    (label,) = build_labels(build_positions((2.0, left, up)))
     assert label["u_px"] == pytest.approx(150 - 180 * left / 2)
     assert label["v_px"] == pytest.approx(100 - 190 * up / 2)
     assert label["depth_m"] == pytest.approx(2.0)
@@ -52,10 +52,10 @@ def test_a_peer_is_seen_in_its_quarter_of_the_image(left: float, up: float) -> N
 
 
 def test_roll_and_pitch_move_labels_in_the_documented_direction() -> None:
-    (rolled,) = labels(positions((2.0, 0.4, 0.0)), roll=0.3)
+    (rolled,) = build_labels(build_positions((2.0, 0.4, 0.0)), roll=0.3)
     assert rolled["u_px"] == pytest.approx(150 - 180 * 0.4 * np.cos(0.3) / 2)
     assert rolled["v_px"] == pytest.approx(100 + 190 * 0.4 * np.sin(0.3) / 2)
-    (pitched,) = labels(positions((2.0, 0.0, 0.0)), pitch=0.2)
+    (pitched,) = build_labels(build_positions((2.0, 0.0, 0.0)), pitch=0.2)
     assert pitched["u_px"] == pytest.approx(150)
     assert pitched["v_px"] == pytest.approx(100 - 190 * np.tan(0.2))
     assert pitched["depth_m"] == pytest.approx(2 * np.cos(0.2))
@@ -67,8 +67,8 @@ def test_label_sigmas_match_sampled_positions_and_attitudes(
     attitude_std_rad: float, spread_m: float
 ) -> None:
     shape = np.array([[1.0, 0.3, 0.1], [0.3, 0.6, -0.2], [0.1, -0.2, 0.4]])
-    found = positions((2.0, 0.5, -0.3), covariance=spread_m**2 * shape)
-    (label,) = labels(found, CameraOptions(attitude_std_rad), roll=0.1, pitch=-0.2)
+    found = build_positions((2.0, 0.5, -0.3), covariance=spread_m**2 * shape)
+    (label,) = build_labels(found, CameraOptions(attitude_std_rad), roll=0.1, pitch=-0.2)
     rng, count = np.random.default_rng(0), 40_000
     drawn = rng.multivariate_normal(found.xyz_m[0], found.covariance[0], count)
     roll, pitch = rng.normal((0.1, -0.2), attitude_std_rad, (count, 2)).T
@@ -79,10 +79,12 @@ def test_label_sigmas_match_sampled_positions_and_attitudes(
 
 def test_the_view_is_as_wide_and_as_high_as_the_image() -> None:
     right, below = (2.0, -150 / 180 * 2, 0.0), (2.0, 0.0, -150 / 190 * 2)
-    seen = labels(positions(right, below))
+    seen = build_labels(build_positions(right, below))
     assert seen[0]["u_px"] == pytest.approx(300)
-    assert seen[1] is None  # v of 250, in an image of 224
-    upright = labels(positions(right, below), camera=replace(CAMERA, width_px=224, height_px=320))
+    assert seen[1] is None  # v is 250, and the image is 224 px high
+    upright = build_labels(
+        build_positions(right, below), camera=replace(CAMERA, width_px=224, height_px=320)
+    )
     assert upright[0] is None
     assert upright[1]["v_px"] == pytest.approx(250)
 
@@ -95,20 +97,22 @@ def test_peer_just_outside_the_image_is_labelled_within_its_sigma(axis: int, edg
         uv = np.array([150.0, 100.0])
         uv[axis] = edge + outward * sigmas * sigma_px
         xyz = (2.0, -(uv[0] - 150) / 180 * 2, -(uv[1] - 100) / 190 * 2)
-        (label,) = labels(positions(xyz, covariance=covariance))
+        (label,) = build_labels(build_positions(xyz, covariance=covariance))
         assert (label is not None) == named
 
 
 def test_a_margin_is_no_wider_than_three_images() -> None:
     vague = np.diag([0.0, 100.0, 1e-12])
     at = [(2.0, -(u_px - 150) / 180 * 2, 0.0) for u_px in (320 + 3 * 320 - 5, 320 + 3 * 320 + 5)]
-    near, far = labels(positions(*at, covariance=vague))
+    near, far = build_labels(build_positions(*at, covariance=vague))
     assert near is not None
     assert far is None
 
 
 def test_peer_behind_or_too_near_is_not_in_view() -> None:
-    behind, near, ahead = labels(positions((-2.0, 0, 0), (MIN_DEPTH_M - 0.01, 0, 0), (0.06, 0, 0)))
+    behind, near, ahead = build_labels(
+        build_positions((-2.0, 0, 0), (MIN_DEPTH_M - 0.01, 0, 0), (0.06, 0, 0))
+    )
     assert behind is None
     assert near is None
     assert ahead["depth_m"] == pytest.approx(0.06)
@@ -116,7 +120,7 @@ def test_peer_behind_or_too_near_is_not_in_view() -> None:
 
 @pytest.mark.parametrize("status", [STATUS_AMBIGUOUS, STATUS_UNCONVERGED])
 def test_peer_without_position_may_be_anywhere_in_the_image(status: int) -> None:
-    behind, ahead = labels(positions((-3.0, 4.0, 0.0), (2.0, 0.0, 0.0), status=status))
+    behind, ahead = build_labels(build_positions((-3.0, 4.0, 0.0), (2.0, 0.0, 0.0), status=status))
     assert behind == label_anywhere("cf2", CAMERA, 5.0, status)
     assert (behind["u_px"], behind["v_px"], behind["depth_m"]) == (160, 112, 5.0)
     sigmas = [behind[f"sigma_{name}"] for name in ("u_px", "v_px", "depth_m")]
@@ -126,10 +130,12 @@ def test_peer_without_position_may_be_anywhere_in_the_image(status: int) -> None
     assert label_anywhere("cf2", CAMERA, 0.0)["status"] == STATUS_UNCONVERGED
 
 
-def test_undistorted_images_have_no_lens() -> None:
+def test_labels_of_undistorted_images_ignore_the_lens() -> None:
     bent = replace(CAMERA, distortion=(-0.2,))
-    (with_lens,) = labels(positions((2.0, 0.6, 0.0)), camera=bent)
-    (without,) = labels(positions((2.0, 0.6, 0.0)), replace(SHARP, distorted=False), bent)
+    (with_lens,) = build_labels(build_positions((2.0, 0.6, 0.0)), camera=bent)
+    (without,) = build_labels(
+        build_positions((2.0, 0.6, 0.0)), replace(SHARP, distorted=False), bent
+    )
     assert without["u_px"] == pytest.approx(150 - 180 * 0.3)
     assert with_lens["u_px"] == pytest.approx(150 - 180 * 0.3 * (1 - 0.2 * 0.09))
 

@@ -1,4 +1,4 @@
-"""Positions and labels as they stand in a recording."""
+"""Messages of positions, labels and causes in a recording."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -30,17 +30,17 @@ TIMES_S = np.array([0.0, 10.0])
 ROLL_RATE, PITCH_RATE = 0.02, -0.01
 
 
-def log() -> RobotLog:
-    """Rolls and pitches steadily, so that a time can be told by the attitude."""
+def build_log() -> RobotLog:
+    """Return the log of a robot with constant roll and pitch rates, so each time has a tilt."""
     attitude = np.column_stack([ROLL_RATE * TIMES_S, PITCH_RATE * TIMES_S, 0 * TIMES_S])
     return RobotLog((TIMES_S, attitude), (TIMES_S, np.zeros((2, 2))), (TIMES_S, np.ones((2, 1))))
 
 
-def logs(flying: Sequence[str] = ("cf1", "cf2")) -> SensorLogs:
-    return SensorLogs(START_NS, {"cf1": log()}, {}, frozenset(flying), [])
+def build_logs(flying: Sequence[str] = ("cf1", "cf2")) -> SensorLogs:
+    return SensorLogs(START_NS, {"cf1": build_log()}, {}, frozenset(flying), [])
 
 
-def flight(path: Path, images_s: Sequence[float], labels: Sequence[Any] = ()) -> Path:
+def write_flight(path: Path, images_s: Sequence[float], labels: Sequence[Any] = ()) -> Path:
     with RecordingWriter(path, Provenance("test")) as sink:
         sink.write(START_NS, topics.HEIGHT("cf1"), message_class("Height")(height_m=1.0))
         for moment in images_s:
@@ -51,7 +51,7 @@ def flight(path: Path, images_s: Sequence[float], labels: Sequence[Any] = ()) ->
     return path
 
 
-def at(time_s: Sequence[float], status: int = STATUS_OK) -> PeerPositions:
+def build_positions(time_s: Sequence[float], status: int = STATUS_OK) -> PeerPositions:
     count = len(time_s)
     xyz_m = np.column_stack(
         [np.full(count, 2.0), np.linspace(-0.2, 0.2, count), np.full(count, 0.1)]
@@ -61,7 +61,7 @@ def at(time_s: Sequence[float], status: int = STATUS_OK) -> PeerPositions:
     return PeerPositions(time_ns, xyz_m, covariance, np.full(count, status, np.int8))
 
 
-def written(
+def build_labels(
     path: Path, found: dict[str, PeerPositions], camera: Camera, known: SensorLogs
 ) -> list[Any]:
     look = CameraOptions(0.01, cameras={"cf1": camera})
@@ -69,7 +69,7 @@ def written(
 
 
 def test_position_message_has_time_frame_covariance_and_status(tmp_path: Path) -> None:
-    found = at([1.0, 2.0], STATUS_UNCONVERGED)
+    found = build_positions([1.0, 2.0], STATUS_UNCONVERGED)
     series = build_position_series("cf1", "cf2", found)
     assert series.topic == "/cf1/peer/cf2/position"
     with RecordingWriter(tmp_path / "a.mcap", Provenance("test")) as sink:
@@ -86,9 +86,9 @@ def test_position_message_has_time_frame_covariance_and_status(tmp_path: Path) -
 def test_label_has_the_image_time_and_its_exposure_time(tmp_path: Path, delay_s: float) -> None:
     logged_s = [2.0, 4.0, 6.0]
     taken_s = [moment - delay_s for moment in logged_s]
-    found = at([0.25, *taken_s, 9.0])  # and positions between the images
-    path = flight(tmp_path / "a.mcap", logged_s)
-    made = written(path, {"cf2": found}, replace(AIDECK, delay_s=delay_s), logs())
+    found = build_positions([0.25, *taken_s, 9.0])  # the first and last belong to no image
+    path = write_flight(tmp_path / "a.mcap", logged_s)
+    made = build_labels(path, {"cf2": found}, replace(AIDECK, delay_s=delay_s), build_logs())
     assert [m.time_ns for m in made] == [START_NS + round(t * SECOND_NS) for t in logged_s]
     for entry, taken, xyz_m in zip(made, taken_s, found.xyz_m[1:4], strict=True):
         tilt = np.array([ROLL_RATE * taken]), np.array([PITCH_RATE * taken])
@@ -103,8 +103,8 @@ def test_labels_of_other_sources_stay_and_old_estimates_are_replaced(tmp_path: P
     kinds = [{"peer": "cf2", "source": source, "depth_m": 1.0} for source in ("truth", "estimate")]
     before = message_class("PeerLabels")(peers=kinds, sources=["truth", "estimate"])
     image_ns, other_ns = START_NS + 2 * SECOND_NS, START_NS + 3 * SECOND_NS
-    path = flight(tmp_path / "a.mcap", [2.0, 3.0], [(image_ns, before), (other_ns, before)])
-    first, second = written(path, {"cf2": at([2.0])}, AIDECK, logs())
+    path = write_flight(tmp_path / "a.mcap", [2.0, 3.0], [(image_ns, before), (other_ns, before)])
+    first, second = build_labels(path, {"cf2": build_positions([2.0])}, AIDECK, build_logs())
     assert [p.source for p in first.fields["peers"]] == ["truth", "estimate"]
     assert list(first.fields["sources"]) == ["estimate", "truth"]
     assert [p.source for p in second.fields["peers"]] == ["truth"]
@@ -112,8 +112,10 @@ def test_labels_of_other_sources_stay_and_old_estimates_are_replaced(tmp_path: P
 
 
 def test_robot_without_position_is_unconverged_in_every_labelled_image(tmp_path: Path) -> None:
-    path = flight(tmp_path / "a.mcap", [2.0, 3.0])
-    (only,) = written(path, {"cf2": at([2.0])}, AIDECK, logs(["cf1", "cf2", "cf3", "cf4"]))
+    path = write_flight(tmp_path / "a.mcap", [2.0, 3.0])
+    (only,) = build_labels(
+        path, {"cf2": build_positions([2.0])}, AIDECK, build_logs(["cf1", "cf2", "cf3", "cf4"])
+    )
     known, *unknown = only.fields["peers"]
     assert (known.peer, known.status) == ("cf2", STATUS_OK)
     assert [(p.peer, p.status) for p in unknown] == [(f"cf{k}", STATUS_UNCONVERGED) for k in (3, 4)]
@@ -121,9 +123,9 @@ def test_robot_without_position_is_unconverged_in_every_labelled_image(tmp_path:
 
 
 def test_without_any_calibration_there_are_no_labels(tmp_path: Path) -> None:
-    path = flight(tmp_path / "a.mcap", [2.0])
+    path = write_flight(tmp_path / "a.mcap", [2.0])
     made = build_label_messages(
-        read_flight(path), logs(), "cf1", {"cf2": at([2.0])}, CameraOptions(0.01)
+        read_flight(path), build_logs(), "cf1", {"cf2": build_positions([2.0])}, CameraOptions(0.01)
     )
     assert list(made) == []
 

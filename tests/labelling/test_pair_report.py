@@ -1,4 +1,4 @@
-"""The numbers of a pair."""
+"""The report of a pair: its figures, causes and remedies."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -21,8 +21,8 @@ STATUS = [STATUS_OK, STATUS_OK, STATUS_AMBIGUOUS, STATUS_UNCONVERGED, STATUS_OK]
 OFF_M = [(0.3, 0.4), (0.0, 0.0), (3.0, 4.0), (0.0, 1.0), (9.0, 9.0)]
 
 
-def found() -> PeerPositions:
-    """Beside the truth, which goes along x, by OFF_M; the last is after its end."""
+def build_positions() -> PeerPositions:
+    """Return positions with errors OFF_M; the last one is after the end of the truth."""
     time_ns = np.array([1, 2, 3, 4, 60]) * SECOND_NS // 2
     true = np.column_stack([time_ns / SECOND_NS, np.zeros(5), np.ones(5)])
     xyz = true + np.column_stack([OFF_M, np.full(5, 7.0)])
@@ -30,7 +30,7 @@ def found() -> PeerPositions:
     return PeerPositions(time_ns, xyz, np.array(spread), np.array(STATUS, np.int8))
 
 
-def estimate() -> Estimate:
+def build_estimate() -> Estimate:
     constants = np.zeros(len(PAIR_LAYOUT.constants))
     for value, name, *own in ((0.35, "range_offset", 0, 1), (0.02, "gyro_bias", 0)):
         constants[PAIR_LAYOUT.find(name, *own)] = value
@@ -43,7 +43,7 @@ def estimate() -> Estimate:
     return made
 
 
-def flight(path: Path, truth_s: list[float]) -> Path:
+def write_truth(path: Path, truth_s: list[float]) -> Path:
     with RecordingWriter(path, Provenance("test")) as sink:
         for moment in truth_s:
             at = message_class("PeerPosition")(x=moment, y=0.0, z=1.0)
@@ -51,12 +51,12 @@ def flight(path: Path, truth_s: list[float]) -> Path:
     return path
 
 
-def report(path: Path) -> PairReport:
-    return report_pair(read_flight(path), ("cf1", "cf2"), found(), estimate())
+def build_report(path: Path) -> PairReport:
+    return report_pair(read_flight(path), ("cf1", "cf2"), build_positions(), build_estimate())
 
 
 def test_pair_report_has_sigma_shares_and_rmse(tmp_path: Path) -> None:
-    got = report(flight(tmp_path / "a.mcap", np.arange(0, 4.1, 0.5).tolist()))
+    got = build_report(write_truth(tmp_path / "a.mcap", np.arange(0, 4.1, 0.5).tolist()))
     assert (got.robot, got.peer, got.positions) == ("cf1", "cf2", 5)
     assert (got.kept_share, got.ambiguous_share) == pytest.approx((0.6, 0.2))
     assert got.range_bias_m == pytest.approx(0.35)
@@ -67,21 +67,21 @@ def test_pair_report_has_sigma_shares_and_rmse(tmp_path: Path) -> None:
 
 def test_without_truth_there_is_no_error(tmp_path: Path) -> None:
     for name, times_s in (("a.mcap", []), ("b.mcap", [0.5])):
-        got = report(flight(tmp_path / name, times_s))
+        got = build_report(write_truth(tmp_path / name, times_s))
         assert (got.rmse_ok_m, got.rmse_m) == (None, None)
 
 
 def test_report_columns_match_their_headers(tmp_path: Path) -> None:
-    got = report(flight(tmp_path / "a.mcap", [0.0, 4.0]))
+    got = build_report(write_truth(tmp_path / "a.mcap", [0.0, 4.0]))
     cells = dict(zip(got.columns(), got.row(), strict=True))
     assert cells["range bias, m"] == "0.35"
     assert (cells["kept"], cells["ambiguous"]) == ("60.0%", "20.0%")
-    unknown = report(flight(tmp_path / "b.mcap", []))
+    unknown = build_report(write_truth(tmp_path / "b.mcap", []))
     assert dict(zip(got.columns(), unknown.row(), strict=True))["RMSE, m"] == "-"
 
 
 def test_probable_causes_name_the_robot_and_a_remedy(tmp_path: Path) -> None:
-    got = report(flight(tmp_path / "a.mcap", [0.0, 4.0]))
+    got = build_report(write_truth(tmp_path / "a.mcap", [0.0, 4.0]))
     assert [(cause.name, cause.robot) for cause in got.causes] == [
         ("yaw rate bias", "cf2"),
         ("range offset", None),
@@ -108,7 +108,7 @@ def test_a_remedy_fits_the_error_and_not_only_the_sensor() -> None:
 
 
 def test_imprecise_positions_come_with_the_numbers_of_the_gate(tmp_path: Path) -> None:
-    got = report(flight(tmp_path / "a.mcap", [0.0, 4.0]))
+    got = build_report(write_truth(tmp_path / "a.mcap", [0.0, 4.0]))
     imprecise = PairCause(REASONS["imprecise"], 1.0, 0.0, 9.0, None)
     both = [replace(got, causes=[imprecise]), replace(got, sigma_m=0.3, causes=[imprecise])]
     (line,) = explain_causes(both, Gate(0.25, 0.05))
@@ -116,7 +116,7 @@ def test_imprecise_positions_come_with_the_numbers_of_the_gate(tmp_path: Path) -
 
 
 def test_a_cause_of_many_pairs_has_one_line(tmp_path: Path) -> None:
-    got = report(flight(tmp_path / "a.mcap", [0.0, 4.0]))
+    got = build_report(write_truth(tmp_path / "a.mcap", [0.0, 4.0]))
     reports = [
         replace(
             got,
@@ -126,7 +126,7 @@ def test_a_cause_of_many_pairs_has_one_line(tmp_path: Path) -> None:
         )
         for k in range(3, 8)
     ]
-    assert len(explain_causes(reports[:-1])) == 2  # the others are not probable
+    assert len(explain_causes(reports[:-1])) == 2  # two causes are probable
     (line,) = explain_causes([*reports, replace(got, peer="cf8", causes=reports[-1].causes)])
     assert line.startswith("4 pairs (cf1-cf5, cf1-cf6, cf1-cf7, ...): positions are imprecise")
     assert "(70%, 5 to 15 s)" in line and "median sigma of 0.20 to 0.70 m" in line

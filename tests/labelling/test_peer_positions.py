@@ -1,4 +1,4 @@
-"""Positions at 20 Hz and at the images."""
+"""Positions of peers at 20 Hz and at the images."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ from dmrl.labelling.peer_positions import sample_positions
 SECOND_NS = 1_000_000_000
 
 
-def test_a_peer_above_is_above_at_each_time_by_the_sensors_of_heights() -> None:
+def test_relative_height_comes_from_the_height_sensors_at_each_time() -> None:
     time_s = np.arange(0, 10, 0.01)
     none, gap = np.zeros(len(time_s)), np.zeros(len(time_s), bool)
     own, peer = (

@@ -1,4 +1,4 @@
-"""A robot's camera by its recording."""
+"""The camera of a robot is read from its recording or from a file."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -18,7 +18,7 @@ from dmrl.messages import message_class
 from dmrl.recording import Provenance, RecordingWriter
 
 
-def flight(path: Path, **lens: Any) -> Path:
+def write_flight(path: Path, **lens: Any) -> Path:
     fields = {"width": 320, "height": 224, "K": [181, 0, 150, 0, 182, 100, 0, 0, 1], **lens}
     with RecordingWriter(path, Provenance("test")) as sink:
         sink.write(0, topics.CALIBRATION("cf1"), message_class("CameraCalibration")(**fields))
@@ -31,7 +31,9 @@ def flight(path: Path, **lens: Any) -> Path:
 
 @pytest.mark.parametrize("model", ["", "plumb_bob", "rational_polynomial"])
 def test_recorded_camera_equals_written_calibration(tmp_path: Path, model: str) -> None:
-    path = flight(tmp_path / "a.mcap", D=[0.1, 0.2, 0.3, 0.4, 0.5, 0, 0, 0], distortion_model=model)
+    path = write_flight(
+        tmp_path / "a.mcap", D=[0.1, 0.2, 0.3, 0.4, 0.5, 0, 0, 0], distortion_model=model
+    )
     lens = (0.1, 0.2, 0.3, 0.4, 0.5)
     assert find_recorded_camera(read_flight(path), "cf1") == Camera(
         320, 224, 181, 182, 150, 100, lens
@@ -43,14 +45,14 @@ def test_recorded_camera_equals_written_calibration(tmp_path: Path, model: str) 
     "lens", [{"D": [0] * 4, "distortion_model": "equidistant"}, {"D": [0, 0, 0, 0, 0, 0.1]}]
 )
 def test_a_lens_that_dmrl_does_not_know_is_refused(tmp_path: Path, lens: dict[str, Any]) -> None:
-    path = flight(tmp_path / "a.mcap", **lens)
+    path = write_flight(tmp_path / "a.mcap", **lens)
     with pytest.raises(RecordingError, match=r"coefficients, dmrl knows plumb_bob with 5"):
         find_recorded_camera(read_flight(path), "cf1")
 
 
 @pytest.mark.parametrize("lens", [{"K": []}, {"K": [1, 2]}, {"D": [float("inf")]}, {"width": 0}])
-def test_numbers_of_no_camera_are_refused(tmp_path: Path, lens: dict[str, Any]) -> None:
-    path = flight(tmp_path / "a.mcap", **lens)
+def test_invalid_calibrations_are_refused(tmp_path: Path, lens: dict[str, Any]) -> None:
+    path = write_flight(tmp_path / "a.mcap", **lens)
     with pytest.raises(
         RecordingError, match=r"a.mcap: /cf1/camera/calibration (has|is) .*dmrl cali"
     ):
@@ -58,13 +60,13 @@ def test_numbers_of_no_camera_are_refused(tmp_path: Path, lens: dict[str, Any]) 
 
 
 def test_images_have_their_log_times(tmp_path: Path) -> None:
-    path = flight(tmp_path / "a.mcap")
+    path = write_flight(tmp_path / "a.mcap")
     found = read_flight(path).images_ns
     assert {robot: times.tolist() for robot, times in found.items()} == {"cf1": [5, 9]}
 
 
 def test_a_file_for_images_of_another_size_is_refused(tmp_path: Path) -> None:
-    path, file = flight(tmp_path / "a.mcap"), tmp_path / "camera.toml"
+    path, file = write_flight(tmp_path / "a.mcap"), tmp_path / "camera.toml"
     file.write_text(format_camera(AIDECK))
     assert read_robot_camera(read_flight(path, sizes_of=["cf1"]), "cf1", file) == AIDECK
     file.write_text(format_camera(replace(AIDECK, width_px=224, height_px=320)))

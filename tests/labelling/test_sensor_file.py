@@ -12,7 +12,7 @@ from dmrl.labelling.sensor_file import SensorConstants, read_sensors, write_sens
 from dmrl.labelling.sensor_logs import build_sensor_logs
 
 from ..estimation.flights import build_pair, simulate_flight
-from .test_sensor_logs import flight, logs, ranges
+from .test_sensor_logs import read_logs, write_flight, write_ranges
 
 KNOWN = SensorConstants(
     {
@@ -92,7 +92,7 @@ def test_other_file_gives_one_line_error(tmp_path: Path, text: str, words: str) 
 
 
 def test_known_sensor_errors_are_removed_on_reading(tmp_path: Path) -> None:
-    found = logs(tmp_path / "a.mcap", flight, ranges).pairs["cf1", "cf2"]
+    found = read_logs(tmp_path / "a.mcap", write_flight, write_ranges).pairs["cf1", "cf2"]
     known = build_sensor_logs(read_flight(tmp_path / "a.mcap"), 0.1, KNOWN).pairs["cf1", "cf2"]
     assert known.range_m == pytest.approx((found.range_m - 0.1 - 0.35) / 1.02)
     assert known.own.vx_mps == pytest.approx(found.own.vx_mps)

@@ -1,4 +1,4 @@
-"""What is estimated from, and what is left out of it with a word."""
+"""Sensor logs of pairs, and the warnings about what is left out."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -20,13 +20,13 @@ START_NS = 7_000_000_000
 Write = Callable[[float, str, Any], None]
 
 
-def flight(
+def write_flight(
     write: Write,
     robots: tuple[str, ...] = ("cf1", "cf2"),
     until_s: float = 8.0,
     from_s: float = 0.0,
 ) -> None:
-    """Sensors of robots at 20 Hz; every value tells the time."""
+    """Write the sensors of some robots at 20 Hz; values grow with time."""
     for time_s in np.arange(from_s, until_s, 0.05).tolist():
         for robot in robots:
             turn = {"roll_rad": 0.01 * time_s, "pitch_rad": 0.02, "yaw_rate_radps": 0.03 * time_s}
@@ -36,7 +36,7 @@ def flight(
             write(time_s, topics.HEIGHT(robot), message_class("Height")(height_m=1 + 0.1 * time_s))
 
 
-def ranges(write: Write, one: str = "cf1", other: str = "cf2", count: int = 40) -> None:
+def write_ranges(write: Write, one: str = "cf1", other: str = "cf2", count: int = 40) -> None:
     for k in range(count):
         write(
             0.1 + 0.15 * k,
@@ -45,7 +45,8 @@ def ranges(write: Write, one: str = "cf1", other: str = "cf2", count: int = 40) 
         )
 
 
-def logs(path: Path, *parts: Callable[[Write], None], offset_m: float = 0.0) -> SensorLogs:
+def read_logs(path: Path, *parts: Callable[[Write], None], offset_m: float = 0.0) -> SensorLogs:
+    """Write a recording with some parts, and read its sensor logs."""
     with RecordingWriter(path, Provenance("test")) as sink:
         for part in parts:
             part(lambda t, topic, m: sink.write(START_NS + round(t * 1e9), topic, m))
@@ -53,14 +54,14 @@ def logs(path: Path, *parts: Callable[[Write], None], offset_m: float = 0.0) -> 
 
 
 def test_pair_has_one_time_grid_and_ranges_of_both_robots(tmp_path: Path) -> None:
-    back = lambda write: ranges(write, "cf2", "cf1", 30)  # noqa: E731
-    found = logs(tmp_path / "a.mcap", flight, ranges, back, offset_m=0.5)
+    back = lambda write: write_ranges(write, "cf2", "cf1", 30)  # noqa: E731
+    found = read_logs(tmp_path / "a.mcap", write_flight, write_ranges, back, offset_m=0.5)
     assert (found.start_ns, found.warnings, found.flying) == (START_NS, [], {"cf1", "cf2"})
     pair = found.pairs["cf1", "cf2"]
     assert len(pair.range_m) == 70
     assert (np.diff(pair.range_time_s) >= 0).all()
     assert (pair.range_m.min(), pair.range_m.max()) == pytest.approx((1.5, 1.89))
-    # Each range stands at its time, whichever robot measured it.
+    # Ranges of both robots are sorted by time.
     assert pair.range_m == pytest.approx(1.5 + (pair.range_time_s - 0.1) / 15)
     assert np.diff(pair.time_s) == pytest.approx(1 / GRID_RATE_HZ)
     middle = slice(20, -20)
@@ -107,47 +108,50 @@ def test_degrees_are_suspected(tmp_path: Path, change: dict[str, float], said: l
             write(time_s, topics.VELOCITY("cf1"), message_class("Velocity")())
             write(time_s, topics.HEIGHT("cf1"), message_class("Height")())
 
-    only_cf2 = lambda write: flight(write, ("cf2",))  # noqa: E731
-    warnings = logs(tmp_path / "a.mcap", steep, only_cf2, ranges).warnings
+    only_cf2 = lambda write: write_flight(write, ("cf2",))  # noqa: E731
+    warnings = read_logs(tmp_path / "a.mcap", steep, only_cf2, write_ranges).warnings
     assert [": ".join(warning.split(": ")[:2]) for warning in warnings] == said
 
 
-def without(kind: str) -> Callable[[Write], None]:
-    return lambda write: flight(lambda t, topic, m: None if kind in topic else write(t, topic, m))
+def omit_topic(kind: str) -> Callable[[Write], None]:
+    """Return a function like `write_flight` that omits topics with this word."""
+    return lambda write: write_flight(
+        lambda t, topic, m: None if kind in topic else write(t, topic, m)
+    )
 
 
 @pytest.mark.parametrize(
     ("parts", "said"),
     [
         (
-            [without("cf2/velocity"), ranges],
+            [omit_topic("cf2/velocity"), write_ranges],
             ["cf2: no /cf2/velocity; its pairs are left out"],
         ),
         (
-            [lambda w: flight(w, until_s=4.9), ranges],
+            [lambda w: write_flight(w, until_s=4.9), write_ranges],
             ["cf1-cf2: their logs share 4.9 s, under 5 s; left out. Do their clocks agree?"],
         ),
         (
-            [lambda w: flight(w, from_s=3.0, until_s=7.33), ranges],
+            [lambda w: write_flight(w, from_s=3.0, until_s=7.33), write_ranges],
             ["cf1-cf2: their logs share 4.3 s, under 5 s; left out. Do their clocks agree?"],
         ),
         (
-            [flight, lambda w: ranges(w, count=MIN_RANGES - 1)],
+            [write_flight, lambda w: write_ranges(w, count=MIN_RANGES - 1)],
             [f"cf1-cf2: {MIN_RANGES - 1} usable ranges, under {MIN_RANGES}; left out"],
         ),
     ],
     ids=["no velocity", "short", "late and short", "few ranges"],
 )
 def test_omitted_pairs_are_reported(tmp_path: Path, parts: list[Any], said: list[str]) -> None:
-    found = logs(tmp_path / "a.mcap", *parts)
+    found = read_logs(tmp_path / "a.mcap", *parts)
     assert not found.pairs
     assert found.warnings == said
 
 
-def test_a_grid_is_of_the_time_that_both_logs_share(tmp_path: Path) -> None:
-    early = lambda write: flight(write, ("cf1",))  # noqa: E731
-    late = lambda write: flight(write, ("cf2",), until_s=9.0, from_s=2.0)  # noqa: E731
-    found = logs(tmp_path / "a.mcap", early, late, ranges)
+def test_the_grid_covers_the_time_that_both_logs_share(tmp_path: Path) -> None:
+    early = lambda write: write_flight(write, ("cf1",))  # noqa: E731
+    late = lambda write: write_flight(write, ("cf2",), until_s=9.0, from_s=2.0)  # noqa: E731
+    found = read_logs(tmp_path / "a.mcap", early, late, write_ranges)
     time_s = found.pairs["cf1", "cf2"].time_s
     assert (time_s[0], time_s[-1]) == pytest.approx((2.0, 7.95), abs=1.01 / GRID_RATE_HZ)
 
@@ -160,15 +164,17 @@ def test_sensor_with_only_nan_is_omitted(tmp_path: Path, kind: str) -> None:
                 setattr(m, field.name, float("nan"))
             write(t, topic, m)
 
-        flight(one)
+        write_flight(one)
 
-    found = logs(tmp_path / "a.mcap", spoilt, ranges)
+    found = read_logs(tmp_path / "a.mcap", spoilt, write_ranges)
     assert not found.pairs and set(found.robots) == {"cf1"}
     assert f"/cf2/{kind}: nothing to use; its pairs are left out" in found.warnings
 
 
 def test_enough_ranges_are_just_enough(tmp_path: Path) -> None:
-    found = logs(tmp_path / "a.mcap", flight, lambda w: ranges(w, count=MIN_RANGES))
+    found = read_logs(
+        tmp_path / "a.mcap", write_flight, lambda w: write_ranges(w, count=MIN_RANGES)
+    )
     assert len(found.pairs["cf1", "cf2"].range_m) == MIN_RANGES
 
 
@@ -178,9 +184,9 @@ def test_silence_is_a_gap_of_that_robot(tmp_path: Path) -> None:
             if not (3.0 < t < 5.0 and topic == "/cf2/attitude"):
                 write(t, topic, m)
 
-        flight(loud)
+        write_flight(loud)
 
-    found = logs(tmp_path / "a.mcap", silent, ranges)
+    found = read_logs(tmp_path / "a.mcap", silent, write_ranges)
     pair = found.pairs["cf1", "cf2"]
     assert not pair.own.dropout.any()
     assert pair.peer.dropout[np.abs(pair.time_s - 4.0) < 0.5].all()
@@ -190,8 +196,8 @@ def test_silence_is_a_gap_of_that_robot(tmp_path: Path) -> None:
 
 
 def test_robot_with_log_but_no_pair_is_reported(tmp_path: Path) -> None:
-    three = lambda write: flight(write, ("cf1", "cf2", "cf3"))  # noqa: E731
-    found = logs(tmp_path / "a.mcap", three, ranges)
+    three = lambda write: write_flight(write, ("cf1", "cf2", "cf3"))  # noqa: E731
+    found = read_logs(tmp_path / "a.mcap", three, write_ranges)
     assert found.flying == {"cf1", "cf2", "cf3"}
     assert found.warnings == [
         "cf3: it has a log but no position, so no image counts as one without it"
@@ -206,7 +212,7 @@ def test_non_finite_samples_and_backward_clocks_are_reported(tmp_path: Path) -> 
 
     path = tmp_path / "a.mcap"
     with count_left_out() as left_out:
-        found = logs(path, flight, ranges, bad)
+        found = read_logs(path, write_flight, write_ranges, bad)
     (doubt,) = found.warnings
     assert doubt.endswith("values are over 30000 m, which no flight gives")
     assert left_out.counts == {
@@ -222,7 +228,7 @@ def test_non_finite_samples_and_backward_clocks_are_reported(tmp_path: Path) -> 
             m,
             publish_ns=START_NS + round((t - 3 * (t > 4)) * 1e9),
         )
-        flight(late)
-        ranges(late)
+        write_flight(late)
+        write_ranges(late)
     back = build_sensor_logs(read_flight(tmp_path / "b.mcap")).warnings
     assert "/cf1/attitude: its clock goes back 1 times; samples overlap there" in back

@@ -1,4 +1,4 @@
-"""Signals that tell how clocks differ, against motion that is known."""
+"""Clock offsets are found by aligning signals of a known motion."""
 
 from pathlib import Path
 from typing import Any
@@ -26,19 +26,22 @@ TIME_S = np.arange(0, 30, 0.05)
 LATE_S = 0.13
 
 
-def smooth(seed: int, time_s: Any, per_s: float = 1.0) -> Any:
-    """A sum of some waves, and of them the slope."""
+def draw_smooth_signal(seed: int, time_s: Any, per_s: float = 1.0) -> Any:
+    """Return a sum of random waves, and its derivative."""
     rng = np.random.default_rng(seed)
     rates, phases = rng.uniform(0.5, 4.0, 5) * per_s, rng.uniform(0, 6, 5)
     waves = np.sin(np.outer(time_s, rates) + phases)
     return waves.sum(axis=1) / 5, (np.cos(np.outer(time_s, rates) + phases) * rates).sum(axis=1) / 5
 
 
-def mocap(path: Path, only: str, tf: bool = False) -> Any:
-    """A robot whose own log is late, and that moves in one way alone."""
-    (roll, _), (pitch, _) = (smooth(k, TIME_S) for k in (1, 2))
-    yaw, yaw_rate = smooth(3, TIME_S)
-    high, _ = smooth(4, TIME_S)
+def estimate_from_mocap(path: Path, only: str, tf: bool = False) -> Any:
+    """Record a robot with a late log that moves along one axis only; estimate its clock.
+
+    Motion capture gives the poses on /pose/truth, or on /tf.
+    """
+    (roll, _), (pitch, _) = (draw_smooth_signal(k, TIME_S) for k in (1, 2))
+    yaw, yaw_rate = draw_smooth_signal(3, TIME_S)
+    high, _ = draw_smooth_signal(4, TIME_S)
     moves = {"roll": 0, "pitch": 0, "yaw rate": 0, "height": 0} | {only: 0.3}
     angles = np.column_stack(
         [moves["roll"] * roll, moves["pitch"] * pitch, moves["yaw rate"] * yaw]
@@ -66,20 +69,20 @@ def mocap(path: Path, only: str, tf: bool = False) -> Any:
 
 @pytest.mark.parametrize("only", ["roll", "pitch", "yaw rate", "height"])
 def test_motion_capture_and_a_robot_agree_in_each_signal(tmp_path: Path, only: str) -> None:
-    found = mocap(tmp_path / "a.mcap", only)
+    found = estimate_from_mocap(tmp_path / "a.mcap", only)
     assert found.keys() == {"cf1"}
     assert found["cf1"].by == only
     assert found["cf1"].offset_s == pytest.approx(-LATE_S, abs=0.01)
 
 
 def test_horizontal_frames_of_motion_capture_count_too(tmp_path: Path) -> None:
-    assert mocap(tmp_path / "a.mcap", "height", tf=True)["cf1"].by == "height"
+    assert estimate_from_mocap(tmp_path / "a.mcap", "height", tf=True)["cf1"].by == "height"
 
 
 def test_ranges_both_ways_set_the_second_robots_clock(tmp_path: Path) -> None:
     path, rng = tmp_path / "a.mcap", np.random.default_rng(0)
     time_s = np.arange(0, 60, 0.05)
-    away, _ = smooth(5, time_s, 0.5)
+    away, _ = draw_smooth_signal(5, time_s, 0.5)
     with RecordingWriter(path, Provenance("test")) as sink:
         for k, moment in enumerate(time_s.tolist()):
             link = ("cf1", "cf2") if k % 2 else ("cf2", "cf1")
@@ -101,10 +104,10 @@ def test_a_camera_and_its_robot_turn_the_same_way(tmp_path: Path, axis: str) -> 
     path, rng = tmp_path / "a.mcap", np.random.default_rng(0)
     scene = rng.integers(0, 256, (12, 16), np.uint8).repeat(12, 0).repeat(12, 1)
     image_s = np.arange(0, 23, 0.1)
-    angle, _ = smooth(6, image_s, 0.6)
-    shift = np.rint(20 * angle).astype(int)  # px; what is seen moves right and up
+    angle, _ = draw_smooth_signal(6, image_s, 0.6)
+    shift = np.rint(20 * angle).astype(int)  # pixels by which the scene moves right or up
     own_s = np.arange(0, 23, 0.05)
-    own, rate = smooth(6, own_s, 0.6)
+    own, rate = draw_smooth_signal(6, own_s, 0.6)
     with RecordingWriter(path, Provenance("test")) as sink:
         for moment, px in zip(image_s.tolist(), shift.tolist(), strict=True):
             turned = (0, px) if axis == "yaw rate" else (-px, 0)
@@ -124,7 +127,7 @@ def test_a_camera_and_its_robot_turn_the_same_way(tmp_path: Path, axis: str) -> 
     assert estimate_camera_clock(read_flight(path), "cf2", {}) is None
 
 
-def test_times_that_repeat_or_go_back_and_no_numbers_are_left_out() -> None:
+def test_repeated_or_backward_times_and_nan_are_left_out() -> None:
     time_s = np.array([0.0, 1.0, 1.0, 0.5, 2.0, 3.0])
     kept_s, kept = _keep_increasing(time_s, np.array([5.0, 6.0, 7.0, 8.0, 9.0, np.nan]))
     assert kept_s.tolist() == [0.0, 1.0, 2.0]
@@ -133,9 +136,11 @@ def test_times_that_repeat_or_go_back_and_no_numbers_are_left_out() -> None:
 
 def test_pose_signals_equal_own_sensor_signals() -> None:
     time_s = np.arange(0, 4, 0.025)
-    (roll, _), (pitch, _), (yaw, yaw_rate), (x, vx), (y, vy) = (smooth(k, time_s) for k in range(5))
+    (roll, _), (pitch, _), (yaw, yaw_rate), (x, vx), (y, vy) = (
+        draw_smooth_signal(k, time_s) for k in range(5)
+    )
     angles = np.column_stack([0.8 * roll, 0.9 * pitch, 8 * yaw])
-    assert np.abs(angles[:, 2]).max() > np.pi  # so that it wraps
+    assert np.abs(angles[:, 2]).max() > np.pi  # the yaw of the pose wraps
     rows = np.column_stack([x, 2 * y, 1 + roll, euler_to_quaternion(angles)])
     found = _pose_signals(time_s, rows)
     assert found["roll"][1] == pytest.approx(0.8 * roll)
@@ -157,7 +162,7 @@ def test_poses_that_are_too_near_to_each_other_are_left_out() -> None:
 
 def test_most_certain_signal_sets_the_clock() -> None:
     rng = np.random.default_rng(0)
-    one, two = (smooth(k, TIME_S)[0] for k in (7, 8))
+    one, two = (draw_smooth_signal(k, TIME_S)[0] for k in (7, 8))
     noisy = two + rng.normal(0, 0.2, len(two))
     reference = {"vague": (TIME_S, two), "sharp": (TIME_S, one), "alone": (TIME_S, one)}
     other = {"vague": (TIME_S + 0.1, noisy), "sharp": (TIME_S + LATE_S, one)}
