@@ -1,4 +1,4 @@
-"""Random small float networks, and their int8 form by the quantiser."""
+"""Random small float networks, and their int8 networks from the quantiser."""
 
 from dataclasses import replace
 from functools import cache
@@ -28,7 +28,9 @@ from dmrl.learn.networks.trace import trace_operations
 SUB_CELL = ("log_depth", "confidence", "offset_u", "offset_v")
 
 
-class _Growing:
+class _GraphBuilder:
+    """A float network that grows layer by layer, with images to compute its shapes."""
+
     def __init__(self, rng: np.random.Generator, images: NDArray[np.uint8]) -> None:
         self.rng = rng
         self.layers: list[FloatLayer] = []
@@ -41,7 +43,7 @@ class _Growing:
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Channels, rows and columns of the last tensor."""
+        """Return channels, rows and columns of the last tensor."""
         return compute_tensors(self.graph, self.input)[-1].shape[1:]
 
     def conv(self, outs: int, kernel: int, *, depthwise: bool = False, stride: int = 1,
@@ -49,7 +51,7 @@ class _Growing:
         ins = self.shape[0]
         shape = (ins, 1, kernel, kernel) if depthwise else (outs, ins, kernel, kernel)
         spread = 1.5 / np.sqrt(np.prod(shape[1:]))
-        # Channels of very different size, as normalisation leaves them.
+        # The scales of channels differ widely, as after folding a normalisation.
         size = np.exp(self.rng.normal(0, 1, shape[0]))
         weight = self.rng.normal(0, spread, shape) * size[:, None, None, None]
         bias = self.rng.normal(0.2, 0.3, shape[0]) * size
@@ -91,11 +93,11 @@ class _Growing:
 
 
 def random_graph(seed: int) -> tuple[FloatGraph, tuple[str, ...], NDArray[np.uint8]]:
-    """A float network, its channels, and (4, height, width, channels) images for it."""
+    """Draw a float network; return it, its outputs and (4, height, width, channels) images."""
     rng = np.random.default_rng(seed)
     height, width = (int(side) for side in rng.integers(12, 41, 2))
     images = rng.integers(0, 256, (4, height, width, int(rng.choice([1, 3])))).astype(np.uint8)
-    net = _Growing(rng, images)
+    net = _GraphBuilder(rng, images)
     for _ in range(int(rng.integers(2, 6))):
         net.grow()
     channels = SUB_CELL if rng.random() < 0.5 else SUB_CELL[:2]
@@ -105,18 +107,24 @@ def random_graph(seed: int) -> tuple[FloatGraph, tuple[str, ...], NDArray[np.uin
     return FloatGraph(tuple(net.layers), outputs, images.shape[3]), channels, images
 
 
+def draw_rgb_images(seed: int) -> NDArray[np.uint8]:
+    """Return the images of ``random_graph(seed)`` with three channels."""
+    images = random_graph(seed)[2]
+    return np.repeat(images, 3, axis=3) if images.shape[3] == 1 else images
+
+
 @cache
 def quantised_network(seed: int) -> IntegerNetwork:
-    """The int8 form of ``random_graph(seed)``, of at most 40 x 40 px."""
-    graph, channels, images = random_graph(seed)
-    rgb = np.repeat(images, 3, axis=3) if graph.channels == 1 else images
+    """Quantise ``random_graph(seed)``, which takes images of at most 40 x 40 px."""
+    graph, channels, _ = random_graph(seed)
+    rgb = draw_rgb_images(seed)
     graph, ranges = equalise_channels(graph, calibrate_ranges(graph, [rgb]))
     about = NetworkInfo("random", "random", 8, channels, 0.3)
     return quantise_network(graph, ranges, about, measure_moments(graph, rgb))
 
 
-def untrained(name: str, width_px: int = 320, height_px: int = 224) -> IntegerNetwork:
-    """An architecture in int8."""
+def quantise_untrained(name: str, width_px: int = 320, height_px: int = 224) -> IntegerNetwork:
+    """Return an architecture with initial weights, quantised to int8."""
     with torch.random.fork_rng(devices=[]):
         network = build_network(name).eval()
     graph = build_graph(trace_operations(network))

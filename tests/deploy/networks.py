@@ -1,4 +1,4 @@
-"""Random small int8 networks that use every layer: strides, dilations, depthwise, adds, heads."""
+"""Random small int8 networks with strides, dilations, depthwise layers, sums and heads."""
 
 from functools import cache
 
@@ -11,8 +11,8 @@ from dmrl.deploy.int8.reference import accumulate, compute_layer
 Rng = np.random.Generator
 
 
-class _Growing:
-    """A network that grows layer by layer, run on one image of noise to set the scales."""
+class _NetworkBuilder:
+    """A network that grows layer by layer; a noise image runs through it to set the scales."""
 
     def __init__(self, rng: Rng, shape: Shape) -> None:
         self.rng = rng
@@ -75,17 +75,17 @@ class _Growing:
 
 @cache
 def random_network(seed: int) -> IntegerNetwork:
-    """A network of 3 to 9 layers on an image of at most 40 x 40 px."""
+    """Draw a network of 3 to 9 layers for images of at most 40 x 40 px."""
     rng = np.random.default_rng(seed)
     channels = int(rng.choice([1, 3]))
     height, width = (int(x) for x in rng.integers(12, 41, 2))
-    net = _Growing(rng, (channels, height, width))
+    net = _NetworkBuilder(rng, (channels, height, width))
     for _ in range(int(rng.integers(2, 6))):
         _grow_some(net, rng)
     return _with_heads(net, rng)
 
 
-def _grow_some(net: _Growing, rng: Rng) -> None:
+def _grow_some(net: _NetworkBuilder, rng: Rng) -> None:
     small = min(net.shape[1:]) < 8
     kind = rng.choice(["conv", "conv", "depthwise", "pool", "residual", "pointwise"])
     stride = 1 if small else int(rng.choice([1, 1, 2]))
@@ -102,8 +102,8 @@ def _grow_some(net: _Growing, rng: Rng) -> None:
         net.conv(int(rng.integers(1, 13)), 3, stride=stride, dilation=1)
 
 
-def _grow_residual(net: _Growing, rng: Rng, dilation: int) -> None:
-    """x + f(x), the sum with or without ReLU; f is depthwise, then 1x1."""
+def _grow_residual(net: _NetworkBuilder, rng: Rng, dilation: int) -> None:
+    """Add x + f(x), with or without ReLU, where f is a depthwise and a 1x1 convolution."""
     source, shape = len(net.tensors) - 1, net.shape
     net.conv(0, 3, depthwise=True, dilation=dilation)
     if net.shape == shape and rng.random() < 0.5:
@@ -113,7 +113,7 @@ def _grow_residual(net: _Growing, rng: Rng, dilation: int) -> None:
         net.add(source, signed=bool(rng.random() < 0.3))
 
 
-def _with_heads(net: _Growing, rng: Rng) -> IntegerNetwork:
+def _with_heads(net: _NetworkBuilder, rng: Rng) -> IntegerNetwork:
     offsets = bool(rng.random() < 0.5)
     net.conv(4 if offsets else 2, 1, signed=True)
     tensor, stride_px = len(net.tensors) - 1, 8

@@ -7,8 +7,8 @@ from dmrl.deploy.accuracy import compare_peaks, compute_accuracy, decode_points
 from dmrl.learn.inference.matching import Points
 
 
-def outputs(*best: tuple[int, int]) -> dict[str, np.ndarray]:
-    """One sure cell in each image; the depth is e metres in all."""
+def build_outputs(*best: tuple[int, int]) -> dict[str, np.ndarray]:
+    """Return outputs with one confident cell per image and a depth of e metres."""
     logit = np.full((len(best), 4, 5), -4.0)
     for k, cell in enumerate(best):
         logit[k][cell] = 3.0
@@ -16,13 +16,16 @@ def outputs(*best: tuple[int, int]) -> dict[str, np.ndarray]:
 
 
 def test_peak_agreement_is_the_share_of_equal_best_cells() -> None:
-    wanted, got = outputs((0, 1), (2, 3), (3, 4), (1, 1)), outputs((0, 1), (2, 4), (3, 4), (0, 1))
+    wanted, got = (
+        build_outputs((0, 1), (2, 3), (3, 4), (1, 1)),
+        build_outputs((0, 1), (2, 4), (3, 4), (0, 1)),
+    )
     assert compare_peaks(wanted, got) == 0.5
     assert compare_peaks(wanted, wanted) == 1.0
 
 
 def test_int8_detections_are_scored_with_the_common_metrics() -> None:
-    found = decode_points(outputs((0, 1), (2, 3)), 8)
+    found = decode_points(build_outputs((0, 1), (2, 3)), 8)
     sure = found.confidence > 0.5
     assert found.image[sure].tolist() == [0, 1]
     assert (found.u_px[sure].tolist(), found.v_px[sure].tolist()) == ([12, 28], [4, 20])

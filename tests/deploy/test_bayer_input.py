@@ -22,9 +22,9 @@ def test_demosaicing_keeps_uniform_colour() -> None:
 def test_demosaicing_rounds_halves_up_and_mirrors_the_border() -> None:
     raw = np.array([[10, 20, 30, 40], [50, 60, 70, 81], [90, 100, 110, 120]], np.uint8)
     red, green, blue = demosaic(raw).transpose(2, 0, 1)
-    assert red[0].tolist() == [10, 20, 30, 30]  # beyond the last column lies the one before it
+    assert red[0].tolist() == [10, 20, 30, 30]  # the last column is mirrored at the border
     assert green[0, 0] == (20 + 20 + 50 + 50 + 2) // 4
-    assert blue[1].tolist() == [60, 60, 71, 81]  # 70.5 goes up
+    assert blue[1].tolist() == [60, 60, 71, 81]  # 70.5 is rounded up
     assert red[1, 1] == (10 + 30 + 90 + 110 + 2) // 4
 
 

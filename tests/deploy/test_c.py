@@ -22,7 +22,7 @@ from dmrl.deploy.int8.network import IntegerNetwork
 from dmrl.deploy.int8.reference import decode_detections, run_network
 from dmrl.errors import ModelError, SettingError, ToolError
 
-from .graphs import quantised_network, untrained
+from .graphs import quantise_untrained, quantised_network
 from .networks import random_network
 
 pytestmark = pytest.mark.skipif(shutil.which("gcc") is None, reason="no gcc")
@@ -32,40 +32,41 @@ CHECKED = Target("sanitizers", (Build("-O1", "gcc", SANITIZER_FLAGS),))
 
 
 SMALLEST = min(map(random_network, range(20)), key=lambda network: network.macs)
-"""Of twenty, that whose C has the least to do."""
+"""The network with the fewest operations of twenty."""
 
 
-def quantisable(seed: int) -> IntegerNetwork:
-    """``quantised_network``; of the next thousand where one has a layer that never fires."""
+def find_quantisable(seed: int) -> IntegerNetwork:
+    """Return ``quantised_network(seed)``, or that of seed + 1000 if a layer is always zero."""
     try:
         return quantised_network(seed)
     except SettingError:
-        return quantisable(seed + 1000)
+        return find_quantisable(seed + 1000)
 
 
-def noise(network: IntegerNetwork, count: int, seed: int = 0) -> NDArray[np.uint8]:
+def draw_images(network: IntegerNetwork, count: int, seed: int = 0) -> NDArray[np.uint8]:
     shape = (count, network.height_px, network.width_px, network.channels)
     return np.random.default_rng(seed).integers(0, 256, shape, dtype=np.uint8)
 
 
-def proved(network: IntegerNetwork, folder: Path, target: Target) -> TargetResult:
+def verify(network: IntegerNetwork, folder: Path, target: Target) -> TargetResult:
+    """Write the C of a network and compare it with the reference on three noise images."""
     write_c(network, folder, [])
     return verify_target(
-        network, folder, target, compute_expected(network, list(noise(network, 3)))
+        network, folder, target, compute_expected(network, list(draw_images(network, 3)))
     )
 
 
 @pytest.mark.parametrize("seed", range(12))
 @pytest.mark.heavy
 def test_quantized_random_networks_match_the_c_bit_for_bit(seed: int, tmp_path: Path) -> None:
-    result = proved(quantisable(seed), tmp_path, QUICK)
+    result = verify(find_quantisable(seed), tmp_path, QUICK)
     assert (result.error, result.mismatches) == (None, 0)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(200))
 def test_two_hundred_random_networks_match_under_sanitizers(seed: int, tmp_path: Path) -> None:
-    result = proved(quantisable(seed), tmp_path, CHECKED)
+    result = verify(find_quantisable(seed), tmp_path, CHECKED)
     assert (result.error, result.mismatches) == (None, 0)
 
 
@@ -74,7 +75,7 @@ def test_two_hundred_random_networks_match_under_sanitizers(seed: int, tmp_path:
     "seed", [0, *(pytest.param(k, marks=pytest.mark.slow) for k in range(1, 9))]
 )
 def test_random_integer_networks_match_the_reference(seed: int, tmp_path: Path) -> None:
-    result = proved(random_network(seed), tmp_path, CHECKED)
+    result = verify(random_network(seed), tmp_path, CHECKED)
     assert (result.error, result.mismatches) == (None, 0)
 
 
@@ -89,7 +90,7 @@ def test_c_demosaicing_matches_the_reference_in_any_bayer_phase(
     write_c(network, tmp_path, [])
     flags = tuple(f"-DRANDOM_RED_{axis}={k}" for axis, k in zip(("ROW", "COL"), phase, strict=True))
     build = Build("Bayer", "gcc", ("-O1", *flags), bayer=True)
-    raw = noise(network, 1)[0, ..., 0]
+    raw = draw_images(network, 1)[0, ..., 0]
     command = build.compile_program(network, tmp_path, tmp_path)
     said = subprocess.run(command, input=raw.tobytes(), check=True, capture_output=True)
     row, col = phase
@@ -129,11 +130,11 @@ def test_the_c_calls_no_library(level: str, tmp_path: Path) -> None:
 @pytest.mark.heavy
 def test_the_self_test_passes_and_fails_when_a_weight_is_changed(tmp_path: Path) -> None:
     network = quantised_network(2)
-    write_c(network, tmp_path, list(noise(network, 1, seed=5)))
+    write_c(network, tmp_path, list(draw_images(network, 1, seed=5)))
     done = subprocess.run(["make", "test"], cwd=tmp_path, check=True, capture_output=True)
     assert done.stdout.count(b"as the reference") == 2
     (tmp_path / "other").mkdir()
-    write_c(_changed(network), tmp_path / "other", [])
+    write_c(_change_weight(network), tmp_path / "other", [])
     shutil.copy(tmp_path / "other" / "random.c", tmp_path)
     failed = subprocess.run(["make", "test"], cwd=tmp_path, capture_output=True, check=False)
     assert failed.returncode != 0
@@ -153,13 +154,13 @@ def test_the_self_test_needs_no_library_when_silent(tmp_path: Path) -> None:
 @pytest.mark.heavy
 def test_a_self_test_for_raw_mosaics_passes_as_well(tmp_path: Path) -> None:
     network = next(n for n in map(quantised_network, range(20)) if n.channels == 3)
-    write_c(network, tmp_path, list(noise(network, 1)), bayer=True)
+    write_c(network, tmp_path, list(draw_images(network, 1)), bayer=True)
     done = subprocess.run(["make", "test"], cwd=tmp_path, check=True, capture_output=True)
     assert done.stdout.count(b"as the reference") == 2
 
 
-def _changed(network: IntegerNetwork) -> IntegerNetwork:
-    """The same network, one weight of the last convolution moved."""
+def _change_weight(network: IntegerNetwork) -> IntegerNetwork:
+    """Return the network with one changed weight in its last convolution."""
     last = network.layers[-1]
     assert isinstance(last, Conv)
     weight = last.weight.copy()
@@ -174,7 +175,7 @@ def test_layers_may_have_any_names(tmp_path: Path) -> None:
     layers = tuple(
         replace(layer, name=names[k % len(names)]) for k, layer in enumerate(network.layers)
     )
-    result = proved(replace(network, layers=layers), tmp_path, QUICK)
+    result = verify(replace(network, layers=layers), tmp_path, QUICK)
     assert (result.error, result.mismatches) == (None, 0)
 
 
@@ -197,7 +198,7 @@ def test_files_and_functions_are_named_after_the_architecture(
 ) -> None:
     network = replace(SMALLEST, architecture=architecture, name="some folder")
     assert c_name(network) == name
-    result = proved(network, tmp_path, QUICK)
+    result = verify(network, tmp_path, QUICK)
     assert (result.error, result.mismatches) == (None, 0)
     assert {f"{name}.c", f"{name}.h", f"{name}_vectors.h"} <= {f.name for f in tmp_path.iterdir()}
     assert f"int {name}_run(" in (tmp_path / f"{name}.h").read_text()
@@ -230,7 +231,7 @@ def test_the_same_network_gives_the_same_text() -> None:
 def test_first_peaks_are_kept_if_there_are_too_many() -> None:
     network = replace(quantised_network(1), threshold=0.0)
     compiled = CompiledNetwork(network)
-    image = noise(network, 1)[0]
+    image = draw_images(network, 1)[0]
     grids = run_network(network, image)
     for most in (0, 1, 2, 5):
         assert compiled.run_detections(image, most).detections == decode_detections(
@@ -239,8 +240,8 @@ def test_first_peaks_are_kept_if_there_are_too_many() -> None:
 
 
 def test_a_layer_that_the_c_cannot_carry_is_named() -> None:
-    network = next(n for n in map(quantised_network, range(20)) if _depthwise(n) is not None)
-    at = _depthwise(network)
+    network = next(n for n in map(quantised_network, range(20)) if _find_depthwise(n) is not None)
+    at = _find_depthwise(network)
     assert at is not None
     layers = list(network.layers)
     conv = layers[at]
@@ -251,7 +252,8 @@ def test_a_layer_that_the_c_cannot_carry_is_named() -> None:
         generate_source(odd, template_values(odd), bayer=False)
 
 
-def _depthwise(network: IntegerNetwork) -> int | None:
+def _find_depthwise(network: IntegerNetwork) -> int | None:
+    """Return the index of the first depthwise layer."""
     return next(
         (
             k
@@ -280,7 +282,7 @@ def test_without_a_compiler_the_package_to_install_is_named(
 )
 @pytest.mark.heavy
 def test_the_state_fits_a_small_chip(name: str, bytes_: int) -> None:
-    integers = untrained(name)
+    integers = quantise_untrained(name)
     made = generate_source(integers, template_values(integers), bayer=False)
     assert made.values["state_bytes"] + made.values["bayer_bytes"] <= bytes_
 
@@ -288,7 +290,7 @@ def test_the_state_fits_a_small_chip(name: str, bytes_: int) -> None:
 @pytest.mark.heavy
 @pytest.mark.parametrize("name", ["locanet", "dmrl-nano"])
 def test_shipped_architectures_match_the_c_bit_for_bit(name: str, tmp_path: Path) -> None:
-    result = proved(untrained(name, 176, 96), tmp_path, QUICK)
+    result = verify(quantise_untrained(name, 176, 96), tmp_path, QUICK)
     assert (result.error, result.mismatches) == (None, 0)
 
 
@@ -297,8 +299,8 @@ def test_shipped_architectures_match_the_c_bit_for_bit(name: str, tmp_path: Path
 def test_instructions_per_mac_on_riscv_are_limited(name: str, most: float, tmp_path: Path) -> None:
     if find_missing(RISCV, EMULATOR):
         pytest.skip("no RISC-V tools")
-    integers = untrained(name)
+    integers = quantise_untrained(name)
     write_c(integers, tmp_path, [])
-    found = measure_cost(integers, tmp_path, noise(integers, 1)[0])
+    found = measure_cost(integers, tmp_path, draw_images(integers, 1)[0])
     assert found.instructions is not None
     assert found.instructions / integers.macs < most

@@ -1,4 +1,4 @@
-"""Comparison with the published chip's maps of two real images."""
+"""Our int8 maps of two real images, compared with those that the published chip computed."""
 
 import runpy
 from pathlib import Path
@@ -14,7 +14,7 @@ def test_int8_maps_agree_with_the_chip_as_well_as_float(data: Path) -> None:
     assert len(pictures) == 2
     for (name, channel, who), agreement in found.items():
         assert agreement.correlation > 0.949
-        # Sums of floats end differently on other processors, and roundings of weights with them.
+        # Float sums, and hence rounded weights, differ slightly between processors.
         assert agreement.mean_steps <= 1.02 * found[name, channel, "float"].mean_steps, who
         if channel == "confidence":
             assert agreement.mean_steps <= 1.15

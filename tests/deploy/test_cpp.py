@@ -1,4 +1,4 @@
-"""The exported C is clean C++ too, and a C++ program links it either way."""
+"""The exported C also compiles as C++, and a C++ program links with it in both forms."""
 
 import shutil
 import subprocess
@@ -12,8 +12,8 @@ from dmrl.deploy.int8.network import IntegerNetwork
 from dmrl.deploy.int8.reference import decode_detections, run_network
 
 from .graphs import quantised_network
-from .test_c import noise
-from .test_memories import smallest, splittable
+from .test_c import draw_images
+from .test_memories import find_least_near_bytes, find_splittable
 
 WARNINGS = ("-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Werror")
 COMPILERS = {
@@ -42,15 +42,15 @@ int main()
 """
 
 
-def write(folder: Path, kind: str) -> IntegerNetwork:
-    """Write the C of a network: plain, or with two memories."""
-    network = splittable(1) if kind == "two memories" else quantised_network(1)
-    near = smallest(network) if kind == "two memories" else None
+def write_network(folder: Path, kind: str) -> IntegerNetwork:
+    """Write the C of a network, plain or with two memories."""
+    network = find_splittable(1) if kind == "two memories" else quantised_network(1)
+    near = find_least_near_bytes(network) if kind == "two memories" else None
     write_c(network, folder, [], near_bytes=near)
     return network
 
 
-def compiler(name: str) -> tuple[str, ...]:
+def find_compiler(name: str) -> tuple[str, ...]:
     words = COMPILERS[name]
     if shutil.which(words[0]) is None:
         pytest.skip(f"no {words[0]}")
@@ -61,12 +61,12 @@ def compiler(name: str) -> tuple[str, ...]:
 @pytest.mark.parametrize("kind", ["plain", "two memories"])
 @pytest.mark.parametrize("name", COMPILERS)
 def test_every_file_compiles_without_a_warning(name: str, kind: str, tmp_path: Path) -> None:
-    words = compiler(name)
-    write(tmp_path, kind)
+    words = find_compiler(name)
+    write_network(tmp_path, kind)
     sources = sorted(path.name for path in tmp_path.glob("*.c"))
     assert len(sources) == 2
     for source in sources:
-        for bayer in ("0",) if source == "main.c" else ("0", "1"):  # its vectors are RGB
+        for bayer in ("0",) if source == "main.c" else ("0", "1"):  # the vectors of main.c are RGB
             command = [*words, *WARNINGS, "-O1", f"-DRANDOM_BAYER={bayer}", "-c", source]
             subprocess.run([*command, "-o", "x.o"], cwd=tmp_path, check=True, capture_output=True)
 
@@ -75,10 +75,10 @@ def test_every_file_compiles_without_a_warning(name: str, kind: str, tmp_path: P
 @pytest.mark.parametrize("kind", ["plain", "two memories"])
 @pytest.mark.parametrize("name", ["gcc", "g++", "clang++"])
 def test_a_cpp_program_links_it_and_detects_the_same(name: str, kind: str, tmp_path: Path) -> None:
-    words = compiler(name)
+    words = find_compiler(name)
     if shutil.which("g++") is None:
         pytest.skip("no g++")
-    network = write(tmp_path, kind)
+    network = write_network(tmp_path, kind)
     far = kind == "two memories"
     text = PROGRAM.replace("FAR", "static random_far_t away;\n    " if far else "")
     text = text.replace("STATE", "&net, &away" if far else "&net")
@@ -88,7 +88,7 @@ def test_a_cpp_program_links_it_and_detects_the_same(name: str, kind: str, tmp_p
         ["g++", "-DRANDOM_BAYER=0", "program.cpp", "random.o", "-o", "program"],
     ):
         subprocess.run(command, cwd=tmp_path, check=True, capture_output=True)
-    for image in noise(network, 3):
+    for image in draw_images(network, 3):
         done = subprocess.run(
             [tmp_path / "program"], input=image.tobytes(), check=True, capture_output=True
         )

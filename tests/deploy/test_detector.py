@@ -1,4 +1,4 @@
-"""Detectors opened with each backend give the same results."""
+"""Detectors that are opened with each backend give equal results."""
 
 import json
 import os
@@ -47,7 +47,8 @@ def test_int8_backends_give_equal_outputs(backend: str, tmp_path: Path) -> None:
     )
 
 
-def run_folder(folder: Path) -> Path:
+def write_run_folder(folder: Path) -> Path:
+    """Write the run folder of a network with random weights for 64 x 48 px."""
     folder.mkdir()
     network = build_network("locanet", seed=3).eval()
     with torch.no_grad():
@@ -59,7 +60,7 @@ def run_folder(folder: Path) -> Path:
 
 @pytest.mark.heavy
 def test_float_backends_and_export_give_equal_outputs(tmp_path: Path) -> None:
-    run = run_folder(tmp_path / "run")
+    run = write_run_folder(tmp_path / "run")
     images = np.random.default_rng(0).integers(0, 256, (2, 48, 64, 3), np.uint8)
     export = tmp_path / "export"
     export.mkdir()
@@ -108,7 +109,7 @@ def test_float_backends_and_export_give_equal_outputs(tmp_path: Path) -> None:
         ((64, 48), (72, 48), False),
     ],
 )
-def test_images_are_of_its_size_or_of_whole_cells(
+def test_images_must_have_the_network_s_size_or_whole_cells(
     size_px: tuple[int, int] | None, image_px: tuple[int, int], fits: bool
 ) -> None:
     detector = Detector("m", lambda images: images, 8, 0.5, size_px, None)  # type: ignore[arg-type,return-value]
@@ -160,7 +161,7 @@ def test_the_cache_keeps_the_newest_models(tmp_path: Path, monkeypatch: pytest.M
         for suffix in (".onnx", ".json"):
             (folder / name).with_suffix(suffix).touch()
         os.utime(folder / f"{name}.onnx", (1e9 - age_s, 1e9 - age_s))
-    made, _ = float_cache.build_float_onnx_once(run_folder(tmp_path / "run"), grey=False)
+    made, _ = float_cache.build_float_onnx_once(write_run_folder(tmp_path / "run"), grey=False)
     kept = {path.stem for path in folder.glob("*.onnx")}
     assert len(kept) == 2 and "newer" in kept
     assert {path.stem for path in folder.glob("*.json")} == kept

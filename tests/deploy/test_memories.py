@@ -1,4 +1,4 @@
-"""Two memories: placement of buffers, and layers that use near memory only."""
+"""C for two memories: buffers are placed, and layers use near memory only."""
 
 import re
 import shutil
@@ -17,7 +17,7 @@ from dmrl.deploy.c.run.verification import TargetResult, compute_expected, verif
 from dmrl.deploy.int8.network import IntegerNetwork
 from dmrl.errors import SettingError
 
-from .graphs import quantised_network, untrained
+from .graphs import quantise_untrained, quantised_network
 from .networks import random_network
 
 pytestmark = pytest.mark.heavy
@@ -26,8 +26,8 @@ GUARDED = Target("sanitizers", (Build("-O1", "gcc", SANITIZER_FLAGS),))
 no_gcc = pytest.mark.skipif(shutil.which("gcc") is None, reason="no gcc")
 
 
-def smallest(network: IntegerNetwork) -> int:
-    """The least near memory that will do, as the error says; 0: all of it has to be near."""
+def find_least_near_bytes(network: IntegerNetwork) -> int:
+    """Return the least sufficient near memory from the error; 0 if everything must be near."""
     whole = plan_buffers(network)
     with pytest.raises(SettingError, match="at least") as error:
         place_buffers(whole, 0)
@@ -35,27 +35,27 @@ def smallest(network: IntegerNetwork) -> int:
     return least if least < Placement(whole).near_bytes(bayer=True) else 0
 
 
-def splittable(seed: int) -> IntegerNetwork:
-    """A random network that gains by a far memory; of every hundredth seed from this one on."""
+def find_splittable(seed: int) -> IntegerNetwork:
+    """Return a random network that can use far memory, of every hundredth seed from this one."""
     make = random_network if seed % 2 else quantised_network
-    return next(n for k in range(seed, 10_000, 100) if smallest(n := make(k)))
+    return next(n for k in range(seed, 10_000, 100) if find_least_near_bytes(n := make(k)))
 
 
-def proved(network: IntegerNetwork, folder: Path, near_bytes: int) -> TargetResult:
+def verify(network: IntegerNetwork, folder: Path, near_bytes: int) -> TargetResult:
     write_c(network, folder, [], near_bytes=near_bytes)
-    return verify_target(network, folder, GUARDED, compute_expected(network, images(network)))
+    return verify_target(network, folder, GUARDED, compute_expected(network, draw_images(network)))
 
 
-def images(network: IntegerNetwork) -> list[np.ndarray]:
+def draw_images(network: IntegerNetwork) -> list[np.ndarray]:
     shape = (3, network.height_px, network.width_px, network.channels)
     return list(np.random.default_rng(0).integers(0, 256, shape, dtype=np.uint8))
 
 
 @no_gcc
-@pytest.mark.parametrize("seed", [*range(4), 5, 12, 15, 19, 47])  # every way to read rows
+@pytest.mark.parametrize("seed", [*range(4), 5, 12, 15, 19, 47])  # they cover all ways to read rows
 def test_layers_use_near_memory_only_and_copy_the_stated_bytes(seed: int, tmp_path: Path) -> None:
-    network = splittable(seed)
-    result = proved(network, tmp_path, smallest(network))
+    network = find_splittable(seed)
+    result = verify(network, tmp_path, find_least_near_bytes(network))
     assert (result.error, result.mismatches) == (None, 0)
     assert parse_state_memory(network, tmp_path).far_bytes > 0
 
@@ -63,32 +63,34 @@ def test_layers_use_near_memory_only_and_copy_the_stated_bytes(seed: int, tmp_pa
 @no_gcc
 @pytest.mark.parametrize("name", ["dmrl-nano", "dmrl-nano-fine"])
 def test_shipped_networks_match_with_two_memories(name: str, tmp_path: Path) -> None:
-    network = untrained(name, 176, 96)
-    result = proved(network, tmp_path, smallest(network))
+    network = quantise_untrained(name, 176, 96)
+    result = verify(network, tmp_path, find_least_near_bytes(network))
     assert (result.error, result.mismatches) == (None, 0)
 
 
 @no_gcc
 def test_layer_that_uses_far_memory_is_detected(tmp_path: Path) -> None:
-    network = splittable(3)
-    write_c(network, tmp_path, [], near_bytes=smallest(network))
+    network = find_splittable(3)
+    write_c(network, tmp_path, [], near_bytes=find_least_near_bytes(network))
     code = tmp_path / "random.c"
     text = code.read_text()
     assert "    return to;" in text
     code.write_text(text.replace("    return to;", "    return from;"))
-    result = verify_target(network, tmp_path, GUARDED, compute_expected(network, images(network)))
+    result = verify_target(
+        network, tmp_path, GUARDED, compute_expected(network, draw_images(network))
+    )
     assert result.error
 
 
 @no_gcc
 def test_too_little_copied_traffic_is_detected(tmp_path: Path) -> None:
-    network = splittable(3)
-    write_c(network, tmp_path, [], near_bytes=smallest(network))
+    network = find_splittable(3)
+    write_c(network, tmp_path, [], near_bytes=find_least_near_bytes(network))
     header = tmp_path / "random.h"
     stated = parse_state_memory(network, tmp_path).traffic_bytes
     header.write_text(header.read_text().replace(f"({stated})", f"({stated + 1})"))
     assert verify_target(
-        network, tmp_path, GUARDED, compute_expected(network, images(network))
+        network, tmp_path, GUARDED, compute_expected(network, draw_images(network))
     ).error
 
 
@@ -96,8 +98,8 @@ def test_too_little_copied_traffic_is_detected(tmp_path: Path) -> None:
 def test_the_c_with_two_memories_is_strict_c99_without_a_warning(tmp_path: Path) -> None:
     flags = ("-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Wshadow", "-Werror")
     for seed in range(4):
-        network = splittable(seed)
-        write_c(network, tmp_path, [], near_bytes=smallest(network))
+        network = find_splittable(seed)
+        write_c(network, tmp_path, [], near_bytes=find_least_near_bytes(network))
         for more in ("-DRANDOM_BAYER=0", "-DRANDOM_BAYER=1", "-DRANDOM_COPY=dma"):
             command = ["gcc", *flags, more, "-fsyntax-only", "random.c"]
             subprocess.run(command, cwd=tmp_path, check=True, capture_output=True)
@@ -105,26 +107,30 @@ def test_the_c_with_two_memories_is_strict_c99_without_a_warning(tmp_path: Path)
 
 @no_gcc
 def test_the_self_test_passes_with_two_memories(tmp_path: Path) -> None:
-    network = splittable(0)
-    write_c(network, tmp_path, images(network)[:1], near_bytes=smallest(network))
+    network = find_splittable(0)
+    write_c(network, tmp_path, draw_images(network)[:1], near_bytes=find_least_near_bytes(network))
     done = subprocess.run(["make", "test"], cwd=tmp_path, check=True, capture_output=True)
     assert done.stdout.count(b"as the reference") == 2
     assert "run(&net, &away, image" in (tmp_path / "README.md").read_text()
 
 
 def test_shipped_networks_fit_gap8_with_long_ring_buffers_in_far_memory() -> None:
-    nano, fine = plan_buffers(untrained("dmrl-nano")), plan_buffers(untrained("dmrl-nano-fine"))
+    nano, fine = (
+        plan_buffers(quantise_untrained("dmrl-nano")),
+        plan_buffers(quantise_untrained("dmrl-nano-fine")),
+    )
     for whole, far in ((nano, {"body_5_0"}), (fine, {"body_1_0", "body_9_0"})):
         two = place_buffers(whole, MAX_L1_STATE_BYTES)
         assert two.far == far
         assert two.near_bytes(bayer=True) <= MAX_L1_STATE_BYTES
-    rows = place_buffers(nano, MAX_L1_STATE_BYTES).traffic_bytes - tables(nano)
-    # A row of 40 x 48: five depthwise read three, five shortcuts one, five layers write one.
+    rows = place_buffers(nano, MAX_L1_STATE_BYTES).traffic_bytes - count_table_bytes(nano)
+    # Rows have 40 x 48 bytes. Five depthwise layers read three rows each, five shortcuts read
+    # one, and five layers write one.
     assert rows == 28 * 40 * 48 * (5 * 3 + 5 + 5)
 
 
-def tables(whole: BufferPlan) -> int:
-    """Bytes of weights, biases, multipliers and gains that every row of every step takes."""
+def count_table_bytes(whole: BufferPlan) -> int:
+    """Return the bytes of weights, biases, multipliers and gains copied for all rows."""
     total = 0
     for step, out in zip(whole.steps, whole.buffers[1:], strict=True):
         layer = step.layer
@@ -133,9 +139,9 @@ def tables(whole: BufferPlan) -> int:
 
 
 def test_placement_with_least_traffic_is_chosen() -> None:
-    network = splittable(5)
+    network = find_splittable(5)
     whole = plan_buffers(network)
-    least, most = smallest(network), Placement(whole).near_bytes(bayer=True)
+    least, most = find_least_near_bytes(network), Placement(whole).near_bytes(bayer=True)
     assert not place_buffers(whole, most).far
     sizes = range(least, most, 64)
     ways = [place_buffers(whole, size) for size in sizes]
@@ -147,8 +153,8 @@ def test_placement_with_least_traffic_is_chosen() -> None:
 
 
 def test_the_header_states_both_sizes(tmp_path: Path) -> None:
-    network = splittable(1)
-    write_c(network, tmp_path, [], near_bytes=smallest(network))
-    two = place_buffers(plan_buffers(network), smallest(network))
+    network = find_splittable(1)
+    write_c(network, tmp_path, [], near_bytes=find_least_near_bytes(network))
+    two = place_buffers(plan_buffers(network), find_least_near_bytes(network))
     wanted = StateMemory(two.near_bytes(bayer=False), two.far_bytes, two.traffic_bytes)
     assert parse_state_memory(network, tmp_path) == wanted

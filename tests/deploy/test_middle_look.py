@@ -1,4 +1,4 @@
-"""The magnified middle of images: its pixels, and what is found in it."""
+"""The magnified middle of images: its pixels, and the mapping of its detections."""
 
 import ctypes
 import shutil
@@ -21,15 +21,15 @@ PIXELS = np.random.default_rng(0).integers(0, 256, (224, 320, 3), dtype=np.uint8
 SIZE_PX = (320, 224)
 
 
-def detect(*rows: tuple[float, float, float, float]) -> Detections:
-    """Detections of one image: u, v, depth and confidence."""
+def build_detections(*rows: tuple[float, float, float, float]) -> Detections:
+    """Return detections of one image from rows of u, v, depth and confidence."""
     u_px, v_px, depth_m, confidence = np.array(rows, float).T[:, None]
     zeros = np.zeros_like(u_px)
     count = np.array([len(rows)])
     return Detections(u_px, v_px, depth_m, confidence, 0.1 * depth_m, zeros.astype(int), count)
 
 
-def test_the_middle_is_that_of_bilinear_interpolation() -> None:
+def test_the_middle_is_magnified_by_bilinear_interpolation() -> None:
     around = np.array([[1.5, 0.0, -80.0 + 0.25], [0.0, 1.5, -56.0 + 0.25]])
     wanted = cv2.warpAffine(PIXELS, around, SIZE_PX, flags=cv2.INTER_LINEAR)
     made = magnify_middle(PIXELS)
@@ -37,8 +37,8 @@ def test_the_middle_is_that_of_bilinear_interpolation() -> None:
     np.testing.assert_array_equal(magnify_middle(PIXELS[::-1, ::-1]), made[::-1, ::-1])
 
 
-def test_detections_return_to_their_place_in_the_image() -> None:
-    found = detect((160.0, 112.0, 0.8, 0.9), (0.0, 224.0, 0.4, 0.2))
+def test_detections_are_mapped_to_the_whole_image() -> None:
+    found = build_detections((160.0, 112.0, 0.8, 0.9), (0.0, 224.0, 0.4, 0.2))
     seen = map_detections(found, np.array([True]), SIZE_PX)
     np.testing.assert_allclose(seen.u_px, [[160.0, 320 / 6]])
     np.testing.assert_allclose(seen.v_px, [[112.0, 224 * 5 / 6]])
@@ -50,16 +50,16 @@ def test_detections_return_to_their_place_in_the_image() -> None:
 
 
 def test_near_detections_of_a_middle_are_left_out() -> None:
-    found = detect((20.0, 20.0, 0.2, 0.9), (30.0, 30.0, 0.6, 0.5), (40.0, 40.0, 0.1, 0.3))
+    found = build_detections((20.0, 20.0, 0.2, 0.9), (30.0, 30.0, 0.6, 0.5), (40.0, 40.0, 0.1, 0.3))
     seen = map_detections(found, np.array([True]), SIZE_PX)
     assert seen.count.tolist() == [1]
     assert (seen.confidence[0, 0], seen.depth_m[0, 0]) == (0.5, pytest.approx(0.9))
     assert seen.confidence[0, 1:].tolist() == [0.0, 0.0]
     assert map_detections(found, np.array([False]), SIZE_PX).count.tolist() == [3]
     (nothing,) = map_detections(
-        detect((20.0, 20.0, 0.2, 0.9)), np.array([True]), SIZE_PX
+        build_detections((20.0, 20.0, 0.2, 0.9)), np.array([True]), SIZE_PX
     ).confidence
-    assert nothing.tolist() == [0.0]  # an image has one detection at least
+    assert nothing.tolist() == [0.0]  # an image keeps at least one detection
 
 
 def test_a_peak_of_the_middle_is_in_the_cell_of_its_detection() -> None:
@@ -105,7 +105,7 @@ def test_an_eye_magnifies_every_second_image(magnify: bool, magnified: list[bool
 @pytest.mark.heavy
 @pytest.mark.skipif(shutil.which("gcc") is None, reason="no gcc")
 @pytest.mark.parametrize("channels", [1, 3])
-def test_the_c_magnifies_and_maps_alike(channels: int, tmp_path: Path) -> None:
+def test_the_c_magnifies_and_maps_like_the_reference(channels: int, tmp_path: Path) -> None:
     network = next(n for n in map(quantised_network, range(20)) if n.channels == channels)
     write_c(network, tmp_path, [])
     line = ["gcc", "-std=c99", "-shared", "-fPIC", "-O1", "random.c", "-o", "random.so"]
@@ -131,7 +131,7 @@ def test_the_c_magnifies_and_maps_alike(channels: int, tmp_path: Path) -> None:
     found = (Found * 4)(*(Found(*row, 0, 0) for row in rows))
     assert code.random_from_middle(found, 4) == 3
     wanted = map_detections(
-        detect(*((u / 16, v / 16, d / 1000, 0.5) for u, v, d in rows)),
+        build_detections(*((u / 16, v / 16, d / 1000, 0.5) for u, v, d in rows)),
         np.array([True]),
         (wide, high),
     )

@@ -1,4 +1,4 @@
-"""ONNX files, run by onnxruntime."""
+"""Exported ONNX files, run by onnxruntime, equal the float and the int8 reference."""
 
 from pathlib import Path
 
@@ -15,20 +15,15 @@ from dmrl.deploy.onnx.graph_writer import build_float_onnx, int8_onnx
 from dmrl.deploy.onnx.runtime import OnnxRun
 from dmrl.errors import ModelError
 
-from .graphs import SUB_CELL, quantised_network, random_graph
+from .graphs import SUB_CELL, draw_rgb_images, quantised_network, random_graph
 
 SEEDS = range(25)
-
-
-def rgb_images(seed: int) -> np.ndarray:
-    images = random_graph(seed)[2]
-    return np.repeat(images, 3, axis=3) if images.shape[3] == 1 else images
 
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_float_onnx_computes_the_float_network(seed: int) -> None:
     graph, channels, _ = random_graph(seed)
-    images = rgb_images(seed)
+    images = draw_rgb_images(seed)
     wanted = FloatBackend(graph, channels).outputs(images)
     grid_shape = wanted["confidence"].shape[1:]
     file = build_float_onnx(graph, channels, size_px=images.shape[1:3], grid_shape=grid_shape)
@@ -40,7 +35,7 @@ def test_float_onnx_computes_the_float_network(seed: int) -> None:
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_int8_onnx_gives_the_levels_of_the_reference(seed: int) -> None:
-    require_same_levels(quantised_network(seed), rgb_images(seed))
+    require_same_levels(quantised_network(seed), draw_rgb_images(seed))
 
 
 def require_same_levels(network: IntegerNetwork, images: np.ndarray) -> None:

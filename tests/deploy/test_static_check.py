@@ -1,4 +1,4 @@
-"""Untrusted ONNX files: their demands are checked before onnxruntime loads them."""
+"""Memory and operations of untrusted ONNX files are checked before onnxruntime loads them."""
 
 import pytest
 
@@ -10,8 +10,8 @@ from onnx import TensorProto, helper  # noqa: E402
 from dmrl.deploy.onnx.static_check import require_modest  # noqa: E402
 
 
-def network(*nodes: object, sides: tuple[int, ...] = (4,), image: object = 224) -> bytes:
-    """A network whose output is its image, with nodes beside it."""
+def build_onnx(*nodes: object, sides: tuple[int, ...] = (4,), image: object = 224) -> bytes:
+    """Return the bytes of a network that returns its image, with further nodes."""
     shape = ["N", image, 320, 3]
     made = helper.make_graph(
         [helper.make_node("Identity", ["image"], ["confidence_logit"]), *nodes],
@@ -25,37 +25,46 @@ def network(*nodes: object, sides: tuple[int, ...] = (4,), image: object = 224) 
     return data
 
 
-def node(kind: str, inputs: tuple[str, ...], output: str, **more: object) -> object:
+def build_node(kind: str, inputs: tuple[str, ...], output: str, **more: object) -> object:
     return helper.make_node(kind, list(inputs), [output], **more)
 
 
-MANY = node("ConstantOfShape", ("sides",), "many")
+MANY = build_node("ConstantOfShape", ("sides",), "many")
 BODY = helper.make_graph([], "body", [], [])
 
 
 def test_valid_onnx_network_passes_the_static_check() -> None:
-    require_modest(network(), "a.onnx")
-    require_modest(network(MANY, sides=(1_000, 1_000)), "a.onnx")
+    require_modest(build_onnx(), "a.onnx")
+    require_modest(build_onnx(MANY, sides=(1_000, 1_000)), "a.onnx")
 
 
 @pytest.mark.parametrize(
     ("data", "said"),
     [
-        (network(MANY, sides=(1 << 30,)), "ConstantOfShape makes 4295 MB"),
+        (build_onnx(MANY, sides=(1 << 30,)), "ConstantOfShape makes 4295 MB"),
         (
-            network(MANY, node("MatMul", ("many", "many"), "more"), sides=(6_000, 6_000)),
+            build_onnx(MANY, build_node("MatMul", ("many", "many"), "more"), sides=(6_000, 6_000)),
             "MatMul makes .* 216 billion products",
         ),
         (
-            network(node("Tile", ("image", "times"), "more"), node("Shape", ("image",), "times")),
+            build_onnx(
+                build_node("Tile", ("image", "times"), "more"),
+                build_node("Shape", ("image",), "times"),
+            ),
             "a.onnx cannot be run",
         ),
-        (network(node("Loop", ("sides",), "more", body=BODY)), "Loop runs another graph"),
-        (network(node("If", ("sides",), "more", then_branch=BODY)), "If runs another graph"),
-        (network(node("Scan", ("sides",), "more", body=BODY)), "Scan runs another graph"),
-        (network(node("Gelu", ("image",), "more", domain="com.x")), "Gelu is no standard operator"),
-        (network(image="H"), "the size of image is not known"),
-        (network(node("NonZero", ("image",), "more")), "the size of more is not known"),
+        (build_onnx(build_node("Loop", ("sides",), "more", body=BODY)), "Loop runs another graph"),
+        (
+            build_onnx(build_node("If", ("sides",), "more", then_branch=BODY)),
+            "If runs another graph",
+        ),
+        (build_onnx(build_node("Scan", ("sides",), "more", body=BODY)), "Scan runs another graph"),
+        (
+            build_onnx(build_node("Gelu", ("image",), "more", domain="com.x")),
+            "Gelu is no standard operator",
+        ),
+        (build_onnx(image="H"), "the size of image is not known"),
+        (build_onnx(build_node("NonZero", ("image",), "more")), "the size of more is not known"),
         (b"no network", "a.onnx cannot be run"),
     ],
 )
@@ -66,7 +75,7 @@ def test_oversized_onnx_file_gives_one_line_error(data: bytes, said: str) -> Non
 
 
 def test_constants_in_other_files_are_not_read() -> None:
-    model = onnx.load_model_from_string(network())
+    model = onnx.load_model_from_string(build_onnx())
     constant = model.graph.initializer[0]
     constant.data_location = TensorProto.EXTERNAL
     constant.external_data.add(key="location", value="/etc/passwd")

@@ -1,4 +1,4 @@
-"""Usage programs of every export: they compile, run and give the same detections."""
+"""The example programs in every export compile, run and give the same detections."""
 
 import py_compile
 import re
@@ -23,7 +23,7 @@ COMPILERS = [pair for pair in (("gcc", "g++"), ("clang", "clang++")) if shutil.w
 
 @pytest.fixture(scope="module")
 def folders(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A recording, and the exports of a shipped network: float, int8, and with two memories."""
+    """Make a recording and exports of a shipped network: float, int8, and with two memories."""
     place = tmp_path_factory.mktemp("usage")
     for line in (
         ["sketch", "pictures", "--images", "40"],
@@ -42,33 +42,35 @@ def folders(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return place
 
 
-def programs(folder: Path, kind: str) -> list[str]:
-    """The programs of one language in a README that are to be saved."""
+def read_programs(folder: Path, kind: str) -> list[str]:
+    """Return the example programs of one language in the README of an export."""
     text = (folder / "README.md").read_text(encoding="utf-8")
     text = text[text.index(": from an image to pixels") :]
     return re.findall(rf"```{kind}\n(.*?)```", text, re.DOTALL)
 
 
-def numbers(said: str) -> list[float]:
+def parse_numbers(said: str) -> list[float]:
+    """Return the decimal numbers in the first line."""
     return [float(n) for n in re.findall(r"-?\d+\.\d+", said.splitlines()[0])]
 
 
-def seen(folders: Path) -> np.ndarray:
-    """The first image in which the network finds a robot."""
+def find_image(folders: Path) -> np.ndarray:
+    """Return the first image in which the network finds a robot."""
     images = dmrl.open(folders / "pictures.mcap").images()
     detector = dmrl.load(folders / "network", backend="onnx-int8")
     return next(image for image in images if detector.detect(image[None])[0])
 
 
-def best(model: Path, backend: str, image: np.ndarray) -> list[float]:
+def detect_best(model: Path, backend: str, image: np.ndarray) -> list[float]:
+    """Return u, v, depth and confidence of the first detection."""
     found = dmrl.load(model, backend=backend).detect(image[None])[0][0]
     return [found.u_px, found.v_px, found.depth_m, found.confidence]
 
 
 @pytest.mark.parametrize("name", ["float", "network"])
 def test_onnxruntime_program_finds_the_same_detections(folders: Path, name: str) -> None:
-    folder, image = folders / name, seen(folders)
-    first, node = programs(folder, "python")
+    folder, image = folders / name, find_image(folders)
+    first, node = read_programs(folder, "python")
     (folder / "detect.py").write_text(first)
     (folder / "node.py").write_text(node)
     (folder / "image.png").write_bytes(encode_png(image))
@@ -76,8 +78,8 @@ def test_onnxruntime_program_finds_the_same_detections(folders: Path, name: str)
     line = [sys.executable, "detect.py", "image.png"]
     done = subprocess.run(line, cwd=folder, capture_output=True, text=True, check=True)
     int8 = (folder / "model.int8.onnx").is_file()
-    wanted = best(folder, "onnx-int8" if int8 else "onnx", image)
-    np.testing.assert_allclose(numbers(done.stdout), wanted, atol=0.06)
+    wanted = detect_best(folder, "onnx-int8" if int8 else "onnx", image)
+    np.testing.assert_allclose(parse_numbers(done.stdout), wanted, atol=0.06)
 
 
 @pytest.mark.parametrize("name", ["network", "two"])
@@ -85,8 +87,8 @@ def test_onnxruntime_program_finds_the_same_detections(folders: Path, name: str)
 def test_the_programs_in_c_and_cpp_compile_cleanly_and_find_the_same(
     folders: Path, name: str, cc: str, cxx: str, tmp_path: Path
 ) -> None:
-    folder, image = folders / name, seen(folders)
-    (in_c,), (in_cpp,) = programs(folder, "c"), programs(folder, "cpp")
+    folder, image = folders / name, find_image(folders)
+    (in_c,), (in_cpp,) = read_programs(folder, "c"), read_programs(folder, "cpp")
     (tmp_path / "detect.c").write_text(in_c)
     (tmp_path / "detect.cpp").write_text(in_cpp)
     there = ["-I", str(folder)]
@@ -97,12 +99,12 @@ def test_the_programs_in_c_and_cpp_compile_cleanly_and_find_the_same(
         [cxx, "-std=c++11", *WARNINGS, *there, "detect.cpp", "net.o", "-o", "as_cpp"],
     ):
         subprocess.run(line, cwd=tmp_path, check=True)
-    wanted = best(folder, "integer", image)
+    wanted = detect_best(folder, "integer", image)
     for program in ("as_c", "as_cpp"):
         done = subprocess.run(
             [tmp_path / program], input=image.tobytes(), capture_output=True, check=True
         )
-        np.testing.assert_allclose(numbers(done.stdout.decode()), wanted, atol=0.07)
+        np.testing.assert_allclose(parse_numbers(done.stdout.decode()), wanted, atol=0.07)
 
 
 @pytest.mark.parametrize(
@@ -133,7 +135,7 @@ def test_onnx_detections_equal_decoded_maps(folders: Path, maps: str, decoded: s
 
 @pytest.mark.parametrize("name", list_pretrained())
 def test_shipped_network_exports_its_int8_network(name: str, tmp_path: Path) -> None:
-    """Of the weights that ship: else its outputs would be others. See benchmarks/ship_int8.py."""
+    """Its outputs agree with the shipped weights; benchmarks/ship_int8.py makes it from them."""
     app(["export", name, str(tmp_path / "out")], result_action="return_value")
     assert (tmp_path / "out/model.int8.onnx").is_file() and list((tmp_path / "out").glob("*.c"))
     dmrl.sketch(tmp_path / "drawn", images=12, seed=5)

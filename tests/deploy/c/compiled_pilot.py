@@ -1,4 +1,4 @@
-"""A program of the pilot's C that runs step by step on this machine or under qemu."""
+"""The pilot's C, compiled and run step by step on this machine or under qemu."""
 
 import shutil
 import subprocess
@@ -12,21 +12,21 @@ from dmrl.deploy.c.run.compile_targets import RISCV_FLAGS
 from dmrl.deploy.c.run.toolchain import EMULATOR, RISCV, find_host_compiler, run_program
 
 EXACT = ("-std=gnu99", "-ffp-contract=off")
-"""Flags with which the commands are those of the reference, bit for bit."""
+"""Flags with which the commands equal those of the reference bit for bit."""
 HARNESS = Path(__file__).with_name("pilot_harness.c")
 
 
 class CompiledPilot:
-    """The pilot's C as a process that answers step by step.
+    """The pilot's C as a process that returns a command for each step.
 
     Parameters
     ----------
     folder
-        Folder with pilot.c and pilot.h; the program is built there.
+        Folder with pilot.c and pilot.h, in which the program is built.
     distance_m
-        Distance to keep.
+        Distance to keep, metres.
     emulated
-        Compile for rv32imc and run it under qemu, in place of this machine.
+        Compile for rv32imc and run under qemu; else compile for this machine.
 
     Raises
     ------
@@ -47,14 +47,14 @@ class CompiledPilot:
         self._send(np.array([distance_m], "<f8").tobytes())
 
     def step(self, state: Sequence[float], packet: bytes = b"") -> tuple[float, ...]:
-        """Return vx, vy, vz and the yaw rate.
+        """Return the command: vx, vy, vz, m/s, and yaw rate, rad/s.
 
         Parameters
         ----------
         state
             The seven measurements of the reference's ``step``.
         packet
-            A packet of detections that has arrived since the last step; empty: none has.
+            Packet of detections that has arrived since the last step; empty if none has.
         """
         head = np.array(state, "<f8").tobytes() + np.int32(len(packet)).tobytes()
         self._send(head + packet)

@@ -1,7 +1,8 @@
-/* Steps of the pilot from standard input to standard output, on a computer or under qemu.
+/* Runs the pilot on a computer or under qemu, with steps on standard input and output.
  *
- * A step is: double time, roll, pitch, yaw rate, vx, vy, height; int32 size of a packet of the
- * camera, 0: none has arrived; the packet. The answer is four doubles. The distance comes first. */
+ * First reads the distance to keep, a double. A step consists of the doubles time, roll, pitch, yaw
+ * rate, vx, vy and height, the int32 size of a camera packet (0: no packet), and the packet. The
+ * answer to a step is four doubles. */
 #include "pilot.h"
 
 #if defined(__riscv)

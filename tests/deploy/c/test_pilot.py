@@ -1,4 +1,4 @@
-"""The pilot's C: the commands of its reference, bit for bit, in a whole flight and at random."""
+"""The pilot's C gives the commands of its reference bit for bit, in a flight and at random."""
 
 import shutil
 import subprocess
@@ -38,13 +38,13 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def needs(*programs: str) -> pytest.MarkDecorator:
+def skip_without(*programs: str) -> pytest.MarkDecorator:
     absent = [name for name in programs if shutil.which(name) is None]
     return pytest.mark.skipif(bool(absent), reason=f"no {absent}")
 
 
 class Pictures:
-    """Sketches to calibrate by."""
+    """Sixteen sketched images for the calibration."""
 
     def __len__(self) -> int:
         return 16
@@ -58,8 +58,8 @@ def quantise_nano() -> IntegerNetwork:
     return quantise_model(model, Pictures(), 16, grey=False).network
 
 
-def fly_at_random(seed: int) -> list[tuple[RobotState, float, list[RawDetection]]]:
-    """Steps with jumps, silences, late images, and detections anywhere."""
+def draw_steps(seed: int) -> list[tuple[RobotState, float, list[RawDetection]]]:
+    """Draw 400 steps: state, image time and detections, with gaps, late images and jumps."""
     rng, image_s, steps = np.random.default_rng(seed), -1.0, []
     for k in range(400):
         values = rng.normal(0, [0.1, 0.1, 0.6, 0.5, 0.5], 5).tolist()
@@ -80,14 +80,14 @@ def test_c_pilot_commands_equal_the_reference(folder: Path, emulated: bool) -> N
     commands = []
     with CompiledPilot(folder, DISTANCE_M, emulated=emulated) as compiled:
         pilot, before_s = OnboardFilter(DISTANCE_M), -1.0
-        for state, image_s, found in fly_at_random(1):
+        for state, image_s, found in draw_steps(1):
             fresh = image_s != before_s
             packet = pack_detections(0, round(1000 * image_s), found) if fresh else b""
             before_s = image_s
             expected = pilot.step(state, image_s, found)
             assert compiled.step(state, packet) == expected
             commands.append(expected)
-    assert np.ptp(np.array(commands), axis=0).min() > 0.05  # it did something
+    assert np.ptp(np.array(commands), axis=0).min() > 0.05  # the commands vary
 
 
 def test_pilot_ignores_repeated_and_late_images() -> None:
@@ -96,7 +96,7 @@ def test_pilot_ignores_repeated_and_late_images() -> None:
     again, without = OnboardFilter(DISTANCE_M), OnboardFilter(DISTANCE_M)
     for k in range(1, 60):
         state = hover._replace(time_s=0.05 * k)
-        # The same image again, and one that is too old, change nothing.
+        # A repeated image and one that is too old change nothing.
         late_s = 0.05 if k < 20 else 0.06
         assert again.step(state, late_s, found) == without.step(state, 0.05, found if k < 2 else [])
     assert again.step(state._replace(time_s=3.1), 0.06, found)[:3] == (0.0, 0.0, 0.0)
@@ -110,9 +110,11 @@ def test_packets_are_read_as_they_were_written() -> None:
     assert parse_detections(pack_image(Image(2, 1, "raw", b"ab"))) is None
 
 
-@needs("clang")
+@skip_without("clang")
 @pytest.mark.heavy
-def test_it_compiles_for_a_cortex_m4_without_a_library_and_fits(folder: Path) -> None:
+def test_it_compiles_for_a_cortex_m4_without_a_library_and_has_its_stated_size(
+    folder: Path,
+) -> None:
     size = f'#include "pilot.h"\nchar fits[sizeof(pilot_t) == {PILOT_BYTES} ? 1 : -1];\n'
     (folder / "size.c").write_text(size)
     for name in ("size.c", "pilot.c"):
@@ -120,7 +122,7 @@ def test_it_compiles_for_a_cortex_m4_without_a_library_and_fits(folder: Path) ->
         line += ["-std=c99", "-O2", "-Wall", "-Wextra", "-Werror", "-ffp-contract=off"]
         subprocess.run([*line, "-c", folder / name, "-o", folder / "m4.o"], check=True)
     said = subprocess.run(["nm", folder / "m4.o"], capture_output=True, text=True, check=True)
-    # Nothing but arithmetic and copies of the compiler's own, and no memory of its own.
+    # It calls only arithmetic and copy helpers of the compiler, and has no static memory.
     used = [line.split()[-1] for line in said.stdout.splitlines() if " U " in line]
     assert all(name.startswith("__aeabi") for name in used)
     assert " b " not in said.stdout and " d " not in said.stdout
@@ -128,7 +130,7 @@ def test_it_compiles_for_a_cortex_m4_without_a_library_and_fits(folder: Path) ->
 
 @pytest.mark.heavy
 def test_camera_network_packets_and_pilot_fly_together(folder: Path) -> None:
-    """A flight of 30 s: image, CPX, C network, CPX, C pilot, motion; beside it the reference."""
+    """In a flight of 30 s the C network and pilot, joined by packets, equal the reference."""
     network = quantise_nano()
     chip, flown = CompiledNetwork(network), []
     with (

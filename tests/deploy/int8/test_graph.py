@@ -24,41 +24,41 @@ from dmrl.learn.networks.trace import trace_operations
 IMAGES = np.random.default_rng(0).integers(0, 256, (2, 48, 64, 3)).astype(np.uint8)
 
 
-def settled(name: str) -> Network:
-    """A network with statistics of images behind its normalisations, as training leaves it."""
+def build_settled_network(name: str) -> Network:
+    """Return a network whose normalisations have the statistics of images, as after training."""
     network = build_network(name, seed=1).train()
     with torch.no_grad():
         for parameter in network.parameters():
             parameter += 0.1 * torch.randn(parameter.shape, generator=torch.manual_seed(2))
         for _ in range(5):
-            network(torch_input(IMAGES))
+            network(to_torch_input(IMAGES))
     return network.eval()
 
 
-def torch_input(images: np.ndarray) -> Tensor:
+def to_torch_input(images: np.ndarray) -> Tensor:
     return networks.normalize_images(torch.from_numpy(images).permute(0, 3, 1, 2))
 
 
-def outputs(graph: FloatGraph, images: np.ndarray) -> np.ndarray:
+def compute_outputs(graph: FloatGraph, images: np.ndarray) -> np.ndarray:
     return select_outputs(graph, compute_tensors(graph, normalize_images(images)))
 
 
 @pytest.mark.parametrize("name", ["locanet", "dmrl-nano", "dmrl-nano-fine"])
 @pytest.mark.heavy
 def test_layers_equal_torch(name: str) -> None:
-    network = settled(name)
+    network = build_settled_network(name)
     with torch.no_grad():
-        wanted = network(torch_input(IMAGES)).numpy()
-    got = outputs(build_graph(trace_operations(network)), IMAGES)
+        wanted = network(to_torch_input(IMAGES)).numpy()
+    got = compute_outputs(build_graph(trace_operations(network)), IMAGES)
     assert np.ptp(wanted) > 0.1
     np.testing.assert_allclose(got, wanted, atol=2e-5 * np.abs(wanted).max())
 
 
 def test_a_grey_network_gives_the_same_on_grey_images() -> None:
-    graph = build_graph(trace_operations(settled("locanet")))
+    graph = build_graph(trace_operations(build_settled_network("locanet")))
     grey = rgb_to_grey(IMAGES)
-    wanted = outputs(graph, np.repeat(grey, 3, axis=3))
-    np.testing.assert_allclose(outputs(graph.to_grey(), grey), wanted, rtol=1e-4, atol=1e-5)
+    wanted = compute_outputs(graph, np.repeat(grey, 3, axis=3))
+    np.testing.assert_allclose(compute_outputs(graph.to_grey(), grey), wanted, rtol=1e-4, atol=1e-5)
 
 
 def test_grey_conversion_keeps_grey_images() -> None:
@@ -67,7 +67,7 @@ def test_grey_conversion_keeps_grey_images() -> None:
 
 
 class Odd(Network):
-    """A network with a part of its own between two convolutions."""
+    """A network with any layer or function between two convolutions."""
 
     def __init__(self, part: nn.Module | Callable[[Tensor], Tensor]) -> None:
         super().__init__()
@@ -120,12 +120,12 @@ def test_heads_may_be_separate_convolutions() -> None:
     graph = build_graph(trace_operations(network))
     assert graph.outputs == ((2, 0), (3, 0))
     with torch.no_grad():
-        wanted = network(torch_input(IMAGES)).numpy()
-    np.testing.assert_allclose(outputs(graph, IMAGES), wanted, atol=1e-5)
+        wanted = network(to_torch_input(IMAGES)).numpy()
+    np.testing.assert_allclose(compute_outputs(graph, IMAGES), wanted, atol=1e-5)
 
 
 class Summed(Network):
-    """A sum of two branches, one of which may be read elsewhere too."""
+    """A network with a sum of two branches, one of which may be used again."""
 
     def __init__(self, branch: nn.Module, *, twice: bool = False) -> None:
         super().__init__()
@@ -157,5 +157,5 @@ def test_residual_sum_is_fused_into_the_preceding_dense_convolution(
     graph = build_graph(trace_operations(network))
     assert sum(isinstance(layer, FloatAdd) for layer in graph.layers) == sums
     with torch.no_grad():
-        wanted = network(torch_input(IMAGES)).numpy()
-    np.testing.assert_allclose(outputs(graph, IMAGES), wanted, atol=1e-5)
+        wanted = network(to_torch_input(IMAGES)).numpy()
+    np.testing.assert_allclose(compute_outputs(graph, IMAGES), wanted, atol=1e-5)

@@ -13,8 +13,8 @@ from dmrl.errors import ModelError
 SHAPE = (3, 8, 10)
 
 
-def conv(outs: int = 2, kernel: int = 3, ins: int = 3, **more: Any) -> Conv:
-    """A convolution of ones."""
+def build_conv(outs: int = 2, kernel: int = 3, ins: int = 3, **more: Any) -> Conv:
+    """Return a convolution whose weights are 1."""
     full = {
         "weight": np.ones((outs, ins, kernel, kernel), np.int8),
         "bias": np.zeros(outs, np.int32),
@@ -24,17 +24,20 @@ def conv(outs: int = 2, kernel: int = 3, ins: int = 3, **more: Any) -> Conv:
     return Conv("conv", **{"source": 0, **full, **more})
 
 
-def sound(layer: Any, *shapes: tuple[int, int, int], signed: tuple[bool, ...] = (False,)) -> bool:
+def is_sound(
+    layer: Any, *shapes: tuple[int, int, int], signed: tuple[bool, ...] = (False,)
+) -> bool:
+    """Return whether a layer accepts inputs of these shapes and signedness."""
     return next(layer.iter_faults(shapes or (SHAPE,), signed), None) is None
 
 
 @pytest.mark.parametrize("signed", [False, True])
 def test_a_sum_may_be_as_large_as_int32(signed: bool) -> None:
-    most = 27 * (128 if signed else 255)  # 27 weights of 1, of the largest input
+    most = 27 * (128 if signed else 255)  # the largest input times 27 weights of 1
     for bias, good in ((2**31 - 1 - most, True), (2**31 - most, False)):
         for sign in (1, -1):
-            layer = conv(bias=np.array([0, sign * bias], np.int32))
-            assert sound(layer, signed=(signed,)) == good
+            layer = build_conv(bias=np.array([0, sign * bias], np.int32))
+            assert is_sound(layer, signed=(signed,)) == good
 
 
 @pytest.mark.parametrize(
@@ -48,16 +51,16 @@ def test_a_sum_may_be_as_large_as_int32(signed: bool) -> None:
         ("multiplier", np.array([1, 2**31 - 1]), True),
     ],
 )
-def test_factors_are_of_31_bits_and_a_shift(field: str, value: Any, good: bool) -> None:
-    assert sound(conv(**{field: value})) == good
+def test_multipliers_have_31_bits_and_shifts_1_to_32(field: str, value: Any, good: bool) -> None:
+    assert is_sound(build_conv(**{field: value})) == good
 
 
 def test_shortcut_needs_the_output_shape_and_a_size_preserving_convolution() -> None:
     both, gain = (False, True), np.full(2, 7 << 8, np.int32)
 
     def beside(shape: tuple[int, int, int], **more: Any) -> bool:
-        layer = conv(**{"padding": 1, "shortcut": 1, "gain": gain, **more})
-        return sound(layer, SHAPE, shape, signed=both)
+        layer = build_conv(**{"padding": 1, "shortcut": 1, "gain": gain, **more})
+        return is_sound(layer, SHAPE, shape, signed=both)
 
     assert beside((2, 8, 10))
     assert not beside((3, 8, 10))
@@ -72,18 +75,18 @@ def test_shortcut_needs_the_output_shape_and_a_size_preserving_convolution() -> 
     for signed, largest in ((False, 255), (True, 128)):
         for left, good in ((0, True), (-1, False)):
             bias = np.array([0, most - 7 * largest - left], np.int32)
-            layer = conv(padding=1, shortcut=1, gain=gain, bias=bias)
-            assert sound(layer, SHAPE, (2, 8, 10), signed=(False, signed)) == good
+            layer = build_conv(padding=1, shortcut=1, gain=gain, bias=bias)
+            assert is_sound(layer, SHAPE, (2, 8, 10), signed=(False, signed)) == good
 
 
 def test_weights_fit_the_channels_they_read() -> None:
-    assert sound(conv(kernel=1))
-    assert not sound(conv(ins=2))
-    assert not sound(conv(weight=np.ones((2, 3, 2, 2), np.int8)))
-    assert not sound(conv(weight=np.ones((2, 3, 3, 1), np.int8)))
-    assert sound(conv(outs=3, ins=1, groups=3))
-    assert not sound(conv(outs=2, ins=1, groups=3))
-    assert not sound(conv(outs=4, ins=2, groups=2), (4, 8, 8))
+    assert is_sound(build_conv(kernel=1))
+    assert not is_sound(build_conv(ins=2))
+    assert not is_sound(build_conv(weight=np.ones((2, 3, 2, 2), np.int8)))
+    assert not is_sound(build_conv(weight=np.ones((2, 3, 3, 1), np.int8)))
+    assert is_sound(build_conv(outs=3, ins=1, groups=3))
+    assert not is_sound(build_conv(outs=2, ins=1, groups=3))
+    assert not is_sound(build_conv(outs=4, ins=2, groups=2), (4, 8, 8))
 
 
 @pytest.mark.parametrize(
@@ -93,7 +96,7 @@ def test_weights_fit_the_channels_they_read() -> None:
 def test_convolution_shape_and_mac_count_follow_kernel_positions(
     kernel: int, stride: int, dilation: int, padding: int
 ) -> None:
-    layer = conv(kernel=kernel, stride=stride, dilation=dilation, padding=padding)
+    layer = build_conv(kernel=kernel, stride=stride, dilation=dilation, padding=padding)
 
     def places(side: int) -> int:
         last = side + 2 * padding - dilation * (kernel - 1) - 1
@@ -106,10 +109,10 @@ def test_convolution_shape_and_mac_count_follow_kernel_positions(
 
 
 def test_pools_keep_signedness_and_sums_need_equal_shapes() -> None:
-    assert sound(MaxPool("pool", 0, signed=True), signed=(True,))
-    assert not sound(MaxPool("pool", 0, signed=True))
+    assert is_sound(MaxPool("pool", 0, signed=True), signed=(True,))
+    assert not is_sound(MaxPool("pool", 0, signed=True))
     both = (False, True)
-    assert not sound(Add("add", (0, 1), (2**20, 1), 20), SHAPE, (3, 8, 9), signed=both)
+    assert not is_sound(Add("add", (0, 1), (2**20, 1), 20), SHAPE, (3, 8, 9), signed=both)
     for multipliers, shift, good in (
         ((2**20, 0), 1, True),
         ((0, 2**21 - 1), 30, True),
@@ -119,39 +122,43 @@ def test_pools_keep_signedness_and_sums_need_equal_shapes() -> None:
         ((2**20, 0), 0, False),
         ((2**20, 0), 31, False),
     ):
-        assert sound(Add("add", (0, 1), multipliers, shift), SHAPE, SHAPE, signed=both) == good
+        assert is_sound(Add("add", (0, 1), multipliers, shift), SHAPE, SHAPE, signed=both) == good
 
 
-def network(**more: Any) -> IntegerNetwork:
-    """One layer, and two heads on it; confidence rises by 257 a level."""
+def build_network(**more: Any) -> IntegerNetwork:
+    """Return a network of one layer with two heads, whose confidence rises by 257 per level."""
     table = (np.arange(256) * 257).astype(np.int32)
     heads = {"confidence": Head(1, 0, 0.1, 0, table), "depth": Head(1, 1, 0.1, 0, table)}
-    layers = (conv(signed=True, padding=1, pad_value=128),)
+    layers = (build_conv(signed=True, padding=1, pad_value=128),)
     fields = {"layers": layers, "threshold": 0.5, **heads, **more}
     return IntegerNetwork("a", "b", 3, 8, 10, 8, **fields)
 
 
 def test_threshold_is_the_first_level_at_or_above_it() -> None:
     believed = 0.5 * 65535
-    q = network().threshold_q
-    assert network().confidence.table[q + 128] >= believed > network().confidence.table[q + 127]
-    assert network(threshold=0.0).threshold_q == -128
-    assert network(threshold=1.0).threshold_q == 127
-    low = replace(network().confidence, table=np.zeros(256, np.int32))
-    assert network(confidence=low).threshold_q == 128
+    q = build_network().threshold_q
+    assert (
+        build_network().confidence.table[q + 128]
+        >= believed
+        > build_network().confidence.table[q + 127]
+    )
+    assert build_network(threshold=0.0).threshold_q == -128
+    assert build_network(threshold=1.0).threshold_q == 127
+    low = replace(build_network().confidence, table=np.zeros(256, np.int32))
+    assert build_network(confidence=low).threshold_q == 128
 
 
 def test_heads_are_signed_grid_tensors_without_consumers() -> None:
-    network()
-    unsigned = (conv(padding=1, pad_value=128),)
-    read = (*network().layers, conv(ins=2, kernel=1, signed=True, source=1))
-    small = (*network().layers, conv(ins=2, stride=2, signed=True, source=1))
-    other = Head(2, 1, 0.1, 0, network().depth.table)
+    build_network()
+    unsigned = (build_conv(padding=1, pad_value=128),)
+    read = (*build_network().layers, build_conv(ins=2, kernel=1, signed=True, source=1))
+    small = (*build_network().layers, build_conv(ins=2, stride=2, signed=True, source=1))
+    other = Head(2, 1, 0.1, 0, build_network().depth.table)
     for change in ({"layers": unsigned}, {"layers": read}, {"layers": small, "depth": other}):
         with pytest.raises(ModelError, match="is not a signed tensor of the grid"):
-            network(**change)
-    late = (replace(network().layers[0], source=1),)
+            build_network(**change)
+    late = (replace(build_network().layers[0], source=1),)
     with pytest.raises(ModelError, match="layer conv reads tensors"):
-        network(layers=late)
+        build_network(layers=late)
     with pytest.raises(ModelError, match="layer conv has a multiplier or shift out of range"):
-        network(layers=(replace(network().layers[0], shift=0),))
+        build_network(layers=(replace(build_network().layers[0], shift=0),))

@@ -31,19 +31,14 @@ from dmrl.deploy.int8.quantise import (
 )
 from dmrl.errors import ModelError, SettingError
 
-from ..graphs import quantised_network, random_graph
+from ..graphs import draw_rgb_images, quantised_network, random_graph
 
 ABOUT = NetworkInfo("small", "small", 8, ("log_depth", "confidence"), 0.3)
 NOISE = np.random.default_rng(1).integers(0, 256, (3, 16, 24, 3)).astype(np.uint8)
 
 
-def rgb_images(seed: int) -> np.ndarray:
-    images = random_graph(seed)[2]
-    return np.repeat(images, 3, axis=3) if images.shape[3] == 1 else images
-
-
-def small(weight: float = 1.0, bias: float = 0.0) -> FloatGraph:
-    """A 3x3 convolution with ReLU, then a head of two channels."""
+def build_small_graph(weight: float = 1.0, bias: float = 0.0) -> FloatGraph:
+    """Return a 3x3 convolution with ReLU and a head of two channels."""
     rng = np.random.default_rng(0)
     first = FloatConv("first", (0,), weight * rng.normal(0, 0.3, (4, 3, 3, 3)),
                       np.full(4, bias), padding=1, relu=True)  # fmt: skip
@@ -56,7 +51,7 @@ def test_int8_is_near_float_on_most_random_networks() -> None:
     sqnr_db = []
     for seed in range(60):
         graph, channels, _ = random_graph(seed)
-        images = rgb_images(seed)
+        images = draw_rgb_images(seed)
         wanted = FloatBackend(graph, channels).outputs(images)
         got = build_reference_backend(quantised_network(seed)).outputs(images)
         for name, value in wanted.items():
@@ -71,7 +66,7 @@ def test_channel_equalisation_keeps_outputs() -> None:
     moved = 0
     for seed in range(30):
         graph, _, images = random_graph(seed)
-        ranges = calibrate_ranges(graph, [rgb_images(seed)])
+        ranges = calibrate_ranges(graph, [draw_rgb_images(seed)])
         even, even_ranges = equalise_channels(graph, ranges)
         wanted = select_outputs(graph, compute_tensors(graph, normalize_images(images)))
         tensors = compute_tensors(even, normalize_images(images))
@@ -104,7 +99,7 @@ def test_channel_equalisation_balances_residual_blocks() -> None:
 
 
 def test_large_bias_fits_int32() -> None:
-    graph = small(weight=1e-7, bias=3.0)
+    graph = build_small_graph(weight=1e-7, bias=3.0)
     network = quantise_network(graph, calibrate_ranges(graph, [NOISE]), ABOUT)
     first, head = compute_layer_errors(graph, network, NOISE)[0], network.layers[0]
     assert isinstance(head, Conv)
@@ -113,8 +108,8 @@ def test_large_bias_fits_int32() -> None:
     assert first.sqnr_db > 40
 
 
-def test_the_grid_of_levels_holds_the_range_and_zero() -> None:
-    graph = small()
+def test_the_levels_cover_the_calibrated_range_and_zero() -> None:
+    graph = build_small_graph()
     network = quantise_network(graph, calibrate_ranges(graph, [NOISE]), ABOUT)
     wanted = select_outputs(graph, compute_tensors(graph, normalize_images(NOISE)))
     for head, values in ((network.depth, wanted[:, 0]), (network.confidence, wanted[:, 1])):
@@ -124,7 +119,9 @@ def test_the_grid_of_levels_holds_the_range_and_zero() -> None:
 
 
 def test_lookup_tables_convert_levels_to_confidence_and_depth() -> None:
-    network = quantise_network(small(), calibrate_ranges(small(), [NOISE]), ABOUT)
+    network = quantise_network(
+        build_small_graph(), calibrate_ranges(build_small_graph(), [NOISE]), ABOUT
+    )
     logit = network.confidence.scale * (np.arange(-128, 128) - network.confidence.zero_point)
     np.testing.assert_allclose(
         network.confidence.table / 65535, 1 / (1 + np.exp(-logit)), atol=1e-5
@@ -138,28 +135,34 @@ def test_lookup_tables_convert_levels_to_confidence_and_depth() -> None:
 def test_images_of_one_colour_are_refused() -> None:
     plain = np.stack([np.full((16, 24, 3), level, np.uint8) for level in (0, 90, 255)])
     with pytest.raises(SettingError, match=r"the 3 calibration images is of a single colour"):
-        calibrate_ranges(small(), [plain])
-    assert calibrate_ranges(small(), [NOISE, plain]).images == 6  # one that varies will do
+        calibrate_ranges(build_small_graph(), [plain])
+    assert (
+        calibrate_ranges(build_small_graph(), [NOISE, plain]).images == 6
+    )  # one varying image is enough
 
 
 def test_no_images_are_refused() -> None:
     with pytest.raises(SettingError, match="no images to calibrate on"):
-        calibrate_ranges(small(), [])
+        calibrate_ranges(build_small_graph(), [])
 
 
 def test_a_layer_that_is_always_zero_is_named() -> None:
     with pytest.raises(SettingError, match="layer first is zero for all of the 3 calibration"):
-        calibrate_ranges(small(bias=-100.0), [NOISE])
+        calibrate_ranges(build_small_graph(bias=-100.0), [NOISE])
 
 
 def test_a_network_without_confidence_is_refused() -> None:
-    ranges = calibrate_ranges(small(), [NOISE])
+    ranges = calibrate_ranges(build_small_graph(), [NOISE])
     with pytest.raises(SettingError, match="gives no confidence"):
-        quantise_network(small(), ranges, replace(ABOUT, channels=("log_depth", "class")))
+        quantise_network(
+            build_small_graph(), ranges, replace(ABOUT, channels=("log_depth", "class"))
+        )
 
 
 def test_network_that_violates_its_invariants_is_refused() -> None:
-    network = quantise_network(small(), calibrate_ranges(small(), [NOISE]), ABOUT)
+    network = quantise_network(
+        build_small_graph(), calibrate_ranges(build_small_graph(), [NOISE]), ABOUT
+    )
     first = network.layers[0]
     assert isinstance(first, Conv)
     loud = replace(first, bias=np.full(4, 2**31 - 1, np.int32))
@@ -178,7 +181,7 @@ def test_fixed_point_multipliers_round_by_less_than_an_eighth_of_a_step(
     assert 1 <= shift <= 32
     for divisor, multiplier in zip(divisors, multipliers.tolist(), strict=True):
         assert 1 <= multiplier < 2**31
-        largest = min(2.0**24, 256 * divisor)  # of 500 weights; beyond it the value is clamped
+        largest = min(2.0**24, 256 * divisor)  # the sum of 500 weights, or where values clamp
         assert abs(multiplier / 2**shift - 1 / divisor) * largest <= 1 / 8
 
 
@@ -192,7 +195,7 @@ def test_shift_is_32_if_the_high_word_suffices(divisor: float, wanted: tuple[int
 
 
 @given(st.integers(2, 2047).map(lambda half: 2 * half + 1), st.integers(0, 255), st.integers(-2, 2))
-def test_a_sum_by_its_multiplier_is_the_quotient_rounded_down(
+def test_multiplying_and_shifting_equals_division_rounded_down(
     divisor: int, level: int, beside: int
 ) -> None:
     (multiplier,), shift = _to_fixed_point(np.array([float(divisor)]))
@@ -214,8 +217,8 @@ def test_divisors_are_odd_and_gains_have_16_bits() -> None:
 
 @pytest.mark.parametrize("shortcut", [False, True])
 def test_sums_are_rounded_to_the_nearest_level(shortcut: bool) -> None:
-    """By half a level at most and not to one side, but for what weights of 8 bits lose."""
-    first, head = small().layers
+    """The error is about half a level at most, without a bias to either side."""
+    first, head = build_small_graph().layers
     assert isinstance(first, FloatConv)
     sources = (1, 1) if shortcut else (1,)
     second = FloatConv("second", sources, np.eye(4)[:, :, None, None], np.zeros(4), relu=True)
@@ -230,9 +233,9 @@ def test_sums_are_rounded_to_the_nearest_level(shortcut: bool) -> None:
 
 
 def test_largest_calibration_value_maps_to_the_last_level() -> None:
-    """Unsigned tensors use all of 0 to 255, signed ones -127 to 127."""
+    """Unsigned tensors use the full range 0 to 255, signed ones -127 to 127."""
     rng = np.random.default_rng(2)
-    first = small().layers[0]
+    first = build_small_graph().layers[0]
     assert isinstance(first, FloatConv)
     second = FloatConv("second", (1,), rng.normal(0, 0.5, (4, 4, 1, 1)), np.zeros(4))
     head = FloatConv("head", (2,), rng.normal(0, 0.5, (2, 4, 1, 1)), np.array([0.1, -2.0]))
@@ -246,19 +249,19 @@ def test_largest_calibration_value_maps_to_the_last_level() -> None:
 
 
 def test_calibration_ranges_cover_all_images_in_network_colours() -> None:
-    alone = calibrate_ranges(small(), [NOISE])
+    alone = calibrate_ranges(build_small_graph(), [NOISE])
     for parts in ([NOISE[:1], NOISE[1:]], [NOISE[1:], NOISE[:1]], [NOISE[2:], NOISE[:2]]):
-        together = calibrate_ranges(small(), parts)
+        together = calibrate_ranges(build_small_graph(), parts)
         for one, other in ((together.low, alone.low), (together.high, alone.high)):
             for a, b in zip(one, other, strict=True):
                 np.testing.assert_array_equal(a, b)
     assert (together.images, together.height_px, together.width_px) == (3, 16, 24)
-    grey = calibrate_ranges(small().to_grey(), [NOISE])
+    grey = calibrate_ranges(build_small_graph().to_grey(), [NOISE])
     assert grey.high[0].tolist() == [float(normalize_images(rgb_to_grey(NOISE)).max())]
 
 
 def test_lookup_tables_convert_units_by_output_name() -> None:
-    """Of an offset from the middle of a cell: where from its edge, in sixteenths of a pixel."""
+    """Offsets from the middle of a cell become distances from its edge in 1/16 px."""
     for name in ("offset_u", "offset_v"):
         assert HEAD_CONVERSIONS[name](np.array([0.0, -0.5, 0.5, 1.0]), 8).tolist() == [
             64,

@@ -1,4 +1,4 @@
-"""Integer arithmetic against hand-computed values."""
+"""The integer reference, compared with hand-computed values and the float decoder."""
 
 import numpy as np
 import pytest
@@ -18,8 +18,8 @@ from ..graphs import quantised_network
 from ..networks import random_network
 
 
-def by_hand(layer: Conv, x: np.ndarray, *shortcut: np.ndarray) -> np.ndarray:
-    """A convolution in Python's own integers."""
+def convolve_by_hand(layer: Conv, x: np.ndarray, *shortcut: np.ndarray) -> np.ndarray:
+    """Compute a convolution in a loop over Python integers."""
     outs, rows, cols = layer.output_shape((x.shape,))
     out = np.zeros((outs, rows, cols), np.int64)
     low, high = (-128, 127) if layer.signed else (0, 255)
@@ -52,7 +52,9 @@ def test_convolutions_equal_a_direct_loop(seed: int) -> None:
             for channels, rows, cols in shapes
         ]
         if isinstance(layer, Conv) and shape[0] * shapes[0][0] < 60:
-            np.testing.assert_array_equal(compute_layer(layer, *inputs), by_hand(layer, *inputs))
+            np.testing.assert_array_equal(
+                compute_layer(layer, *inputs), convolve_by_hand(layer, *inputs)
+            )
 
 
 def test_halves_round_up_for_both_signs() -> None:
@@ -72,15 +74,15 @@ def test_an_odd_last_row_is_left_out_of_a_pool() -> None:
     assert compute_layer(MaxPool("pool", 0), x).tolist() == [[[6, 8]]]
 
 
-def network_with(offsets: bool) -> IntegerNetwork:
-    """The first random network that has offsets, or has none; no two levels are one confidence."""
+def find_network(offsets: bool) -> IntegerNetwork:
+    """Return the first random network with or without offsets whose confidence levels differ."""
     found = (quantised_network(seed) for seed in range(50))
     fine = (n for n in found if n.grid_shape > (4, 4) and n.confidence.scale < 0.2)
     return next(n for n in fine if (n.offset_u is not None) == offsets)
 
 
-def grids(network: IntegerNetwork, rng: np.random.Generator) -> dict[str, np.ndarray]:
-    """Heads as a network gives them: many equal values."""
+def draw_levels(network: IntegerNetwork, rng: np.random.Generator) -> dict[str, np.ndarray]:
+    """Draw the levels of all heads, with many equal values."""
     return {
         name: rng.integers(-20, 21, network.grid_shape).astype(np.int8) * 6
         for name in network.heads
@@ -88,19 +90,19 @@ def grids(network: IntegerNetwork, rng: np.random.Generator) -> dict[str, np.nda
 
 
 @pytest.mark.parametrize("offsets", [False, True])
-def test_integer_detections_are_the_float_ones(offsets: bool) -> None:
-    network, rng = network_with(offsets), np.random.default_rng(3)
+def test_integer_detections_equal_the_float_ones(offsets: bool) -> None:
+    network, rng = find_network(offsets), np.random.default_rng(3)
     backend = build_reference_backend(network)
     believed = 0
     for _ in range(50):
-        levels = grids(network, rng)
+        levels = draw_levels(network, rng)
         backend.run = lambda _, levels=levels: levels
         blank = np.zeros((1, network.height_px, network.width_px, 3), np.uint8)
         found = float_decode(*to_grids(backend.outputs(blank)), stride_px=8)
         sure = found.confidence[0, : found.count[0]] >= 0.3
         got = decode_detections(network, levels)
         if offsets and len(got) != sure.sum():
-            continue  # 1/16 px decided whether two are one
+            continue  # rounding to 1/16 px changed whether two peaks are merged
         assert len(got) == sure.sum()
         believed += len(got)
         for k, one in enumerate(got):
@@ -112,7 +114,7 @@ def test_integer_detections_are_the_float_ones(offsets: bool) -> None:
 
 
 def test_equal_neighbouring_cells_give_the_first_detection_only() -> None:
-    network = network_with(offsets=False)
+    network = find_network(offsets=False)
     levels = {name: np.full(network.grid_shape, -128, np.int8) for name in network.heads}
     levels["confidence"][1, 1:3] = 127
     wanted = IntegerDetection(
@@ -133,7 +135,7 @@ def test_the_heads_are_channels_of_their_tensor() -> None:
 
 
 def test_cell_at_the_threshold_is_detected() -> None:
-    network = network_with(offsets=False)
+    network = find_network(offsets=False)
     levels = {name: np.full(network.grid_shape, -128, np.int8) for name in network.heads}
     assert -128 < network.threshold_q <= 127
     for below, count in ((0, 1), (1, 0)):

@@ -1,4 +1,4 @@
-"""Rounding of weights with error compensation."""
+"""Rounding of weights such that errors compensate each other."""
 
 from dataclasses import replace
 
@@ -12,7 +12,7 @@ from dmrl.deploy.int8.graph import FloatConv, FloatGraph, compute_tensors, norma
 from dmrl.deploy.int8.quantise import NetworkInfo, quantise_network
 from dmrl.deploy.int8.rounding import MAX_LEVEL, _round_rows, measure_moments, round_weights
 
-from ..graphs import random_graph
+from ..graphs import draw_rgb_images, random_graph
 
 STEPS = np.random.default_rng(3).integers(0, 9, (4, 24, 32, 3))
 SMOOTH = np.cumsum(STEPS, axis=2).astype(np.uint8)
@@ -24,21 +24,21 @@ def layer(groups: int) -> FloatConv:
     return FloatConv("conv", (0,), weight, rng.normal(0, 0.1, 3), padding=1, groups=groups)
 
 
-def output(one: FloatConv) -> np.ndarray:
+def compute_output(one: FloatConv) -> np.ndarray:
     return compute_tensors(FloatGraph((one,), ()), normalize_images(SMOOTH))[1].astype(np.float64)
 
 
 @pytest.mark.parametrize(("groups", "gain"), [(1, 4), (3, 2)])
 def test_correlated_rounding_beats_nearest_rounding(groups: int, gain: float) -> None:
     one = layer(groups)
-    scale = np.abs(one.weight).max(axis=(1, 2, 3)) / 7  # four bits, so that it shows
+    scale = np.abs(one.weight).max(axis=(1, 2, 3)) / 7  # four bits, for a visible effect
     moments = measure_moments(FloatGraph((one,), ()), SMOOTH)[0]
     weight, bias = round_weights(one, scale, moments)
     steps = scale[:, None, None, None]
     nearest = replace(one, weight=np.rint(one.weight / steps) * steps)
-    wanted = output(one)
-    worse = ((output(nearest) - wanted) ** 2).mean()
-    better = ((output(replace(one, weight=weight * steps, bias=bias)) - wanted) ** 2).mean()
+    wanted = compute_output(one)
+    worse = ((compute_output(nearest) - wanted) ** 2).mean()
+    better = ((compute_output(replace(one, weight=weight * steps, bias=bias)) - wanted) ** 2).mean()
     assert better < worse / gain
 
 
@@ -47,7 +47,7 @@ def test_second_moments_are_mean_products_of_inputs() -> None:
     moments = measure_moments(FloatGraph((one,), ()), SMOOTH)[0]
     x = normalize_images(SMOOTH)
     assert moments.shape == (1, 28, 28)
-    # Tap 4 of 9 is the pixel itself; the last row is the mean.
+    # Tap 4 of 9 is the central pixel, and the last row is the mean.
     assert moments[0, 4, 9 + 4] == pytest.approx((x[:, 0] * x[:, 1]).mean(), rel=1e-4)
     assert moments[0, 4, 27] == pytest.approx(x[:, 0].mean(), rel=1e-4)
     assert moments[0, 27, 27] == 1
@@ -63,11 +63,11 @@ def test_constant_zero_inputs_fall_back_to_nearest_rounding() -> None:
 
 
 @pytest.mark.heavy
-def test_random_networks_lose_less_than_by_nearest_weights() -> None:
+def test_random_networks_are_more_accurate_than_with_nearest_rounding() -> None:
     gained_db = []
     for seed in range(40):
-        graph, channels, images = random_graph(seed)
-        rgb = np.repeat(images, 3, axis=3) if images.shape[3] == 1 else images
+        graph, channels, _ = random_graph(seed)
+        rgb = draw_rgb_images(seed)
         graph, ranges = equalise_channels(graph, calibrate_ranges(graph, [rgb]))
         about = NetworkInfo("random", "random", 8, channels, 0.3)
         wanted = FloatBackend(graph, channels).outputs(rgb)
@@ -89,6 +89,6 @@ def test_random_networks_lose_less_than_by_nearest_weights() -> None:
 
 def test_weights_stay_within_seven_bits_and_a_sign() -> None:
     wanted = np.array([[-127.4, -127.4, -140.0, 200.0, 3.0]])
-    together = np.full((5, 5), 0.9) + 0.1 * np.eye(5)  # what one lost, the next makes good
+    together = np.full((5, 5), 0.9) + 0.1 * np.eye(5)  # later weights compensate earlier errors
     levels = _round_rows(wanted, together)
     assert np.abs(levels[:, :-1]).max() == MAX_LEVEL == 127

@@ -1,4 +1,4 @@
-"""Windows of convolutions and max-pools against loops over all positions."""
+"""Windows of convolutions and max-pools, compared with loops over all positions."""
 
 import numpy as np
 import pytest
@@ -26,7 +26,7 @@ def test_convolution_taps_are_in_raster_order(kernel: int, stride: int, dilation
 
 
 @pytest.mark.parametrize("shape", [(4, 6), (5, 7), (2, 3)])
-def test_the_largest_of_each_block_of_four(shape: tuple[int, int]) -> None:
+def test_max_pool_takes_the_largest_of_each_block_of_four(shape: tuple[int, int]) -> None:
     x = RNG.integers(-9, 9, (2, *shape))
     found = max_pool_2x2(x)
     assert found.shape == (2, shape[0] // 2, shape[1] // 2)

@@ -1,4 +1,4 @@
-"""Verification of C: all grids, detections and builds must match, within the stack."""
+"""Verification of exported C: grids and detections of all builds must match within the stack."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -91,7 +91,7 @@ def test_build_must_answer_every_image_within_its_stack(
         assert result.builds[0].stack_bytes == stack
 
 
-def test_rates_are_images_a_second() -> None:
+def test_rates_are_images_per_second() -> None:
     network = random_network(1)
     both = estimate_rates(network, ExecutionCost(1, 2, round(CLUSTER_HZ / 25)), StateMemory(49_152))
     assert [rate for rate, _ in both] == pytest.approx(
