@@ -1,4 +1,4 @@
-"""A recording in pandas: how far off UWB ranges are, and a file that rerun opens.
+"""Read a recording into pandas, measure the error of UWB ranges, and save a file for rerun.
 
 Run it in an empty folder: python explore.py
 """
@@ -21,7 +21,7 @@ error_m = measured["range_m"] - np.interp(measured["log_time"], truth["log_time"
 median_m, sigma_m = np.median(error_m), error_m.std()
 print(f"{len(error_m)} ranges: median error {median_m:.3f} m, sigma {sigma_m:.3f} m")
 
-# Images are decoded when they are used; labels have a row per peer in view.
+# Images are decoded when they are used; labels have a row for each peer in view.
 images, labels = flight.images("cf1"), flight.labels("cf1")
 print(f"{len(images)} images of {images[0].shape}, {labels['peer'].count()} labels")
 

@@ -1,6 +1,6 @@
-"""Draw a flight as an animated strip: what the follower saw and found, and both paths from above.
+"""Animate a flight: the follower's images with its detections, and both paths from above.
 
-python flight_strip.py FLIGHT.mcap OUT.webp; without arguments it flies three seconds first.
+Run python flight_strip.py FLIGHT.mcap OUT.webp; without arguments it flies three seconds first.
 """
 
 import io
@@ -18,11 +18,11 @@ from dmrl.simulation.settings import FlyFlags
 from dmrl.stages import fly
 
 SIDE_PX, METRES = 224, 5.0
-EVERY = 5  # images
+EVERY = 5  # Draw one image in five.
 
 
 def draw_image(data: bytes, found: Sequence[Any], threshold: float) -> Image.Image:
-    """Return an image with a circle around each sure detection."""
+    """Return the image with a circle around each detection at or above the threshold."""
     picture = Image.open(io.BytesIO(data)).convert("RGB")
     pen = ImageDraw.Draw(picture)
     for one in found:
@@ -34,7 +34,7 @@ def draw_image(data: bytes, found: Sequence[Any], threshold: float) -> Image.Ima
 
 
 def draw_paths(paths: dict[str, np.ndarray]) -> Image.Image:
-    """Return the paths of both drones from above."""
+    """Return a picture of the paths (N, 2) of both drones from above, in metres."""
     picture = Image.new("RGB", (SIDE_PX, SIDE_PX), "white")
     pen = ImageDraw.Draw(picture)
     for (_, xy), colour in zip(sorted(paths.items()), ("seagreen", "firebrick"), strict=True):
@@ -46,7 +46,7 @@ def draw_paths(paths: dict[str, np.ndarray]) -> Image.Image:
 
 
 def read_paths(flight: Path) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """Return times (N,) and the true places (N, 2) of each drone."""
+    """Return times (N,) in ns and the true positions (N, 2) of each drone, in metres."""
     times, places = [], {"cf1": [], "cf2": []}
     for stamped in read(flight, "/tf"):
         moved = {t.child_frame_id: t.translation for t in stamped.message.transforms}
@@ -58,7 +58,7 @@ def read_paths(flight: Path) -> tuple[np.ndarray, dict[str, np.ndarray]]:
 
 
 def draw_strip(flight: Path, out: Path) -> int:
-    """Write the animation; return its number of images."""
+    """Write the animation of a flight; return its number of images."""
     times, paths = read_paths(flight)
     detections = {s.time_ns: s.message for s in read(flight, topics.DETECTIONS("cf1"))}
     frames = []

@@ -1,6 +1,6 @@
-"""A Gymnasium environment: follow a leader by the images of one's own camera.
+"""A Gymnasium environment: follow a leader by the images of the follower's camera.
 
-Needs ``pip install gymnasium`` beside dmrl. Training code of others takes it as any environment.
+Needs ``pip install gymnasium`` beside dmrl. It works with any training code for Gymnasium.
 """
 
 from typing import Any
@@ -16,7 +16,10 @@ FAR_M, NEAR_M = 3.0, 0.2
 
 
 class FollowEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
-    """cf1 is flown by actions, -1 to 1 of each limit; cf2 flies a figure of eight in front."""
+    """An environment in which actions fly cf1 while cf2 flies a figure of eight in front of it.
+
+    An action is four fractions, -1 to 1, of LIMITS: forward, left, up and yaw rate.
+    """
 
     def __init__(self, duration_s: float = 30.0) -> None:
         self.simulation = Simulation(robots=2, flown=1, duration_s=duration_s)
@@ -38,13 +41,16 @@ class FollowEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Start a flight; another seed is another path and noise."""
+        """Start a flight; the seed chooses the path of cf2 and the noise."""
         super().reset(seed=seed)
         flight = int(self.np_random.integers(2**31)) if seed is None else seed
         return self._observe(self.simulation.reset(flight)["cf1"]), {}
 
     def step(self, action: np.ndarray) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
-        """Fly an action for 0.05 s; the reward is 1 at the distance, straight ahead."""
+        """Fly an action for 0.05 s.
+
+        The reward is highest, 1, where cf2 is straight ahead at DISTANCE_M.
+        """
         seen = self.simulation.step({"cf1": (np.clip(action, -1, 1) * LIMITS).tolist()})["cf1"]
         x, y, z = self.simulation.peer_position("cf1", "cf2")
         distance = float(np.linalg.norm((x, y, z)))
@@ -64,7 +70,8 @@ if __name__ == "__main__":
     env.reset(seed=1)
     total, over = 0.0, False
     info = {"distance_m": DISTANCE_M, "bearing_rad": 0.0}
-    while not over:  # steered by the truth; a policy steers by the image
+    # The true position steers here; a policy would steer by the image.
+    while not over:
         ahead = 1.2 * (info["distance_m"] - DISTANCE_M) + 0.3
         _, reward, crashed, ended, info = env.step(
             np.array([ahead, 0.0, 0.0, 2.0 * info["bearing_rad"] / LIMITS[3]])

@@ -1,6 +1,6 @@
-"""Robots that are no Crazyflies: two ground robots with UWB tags, one of them with a camera.
+"""Label robots other than Crazyflies: two ground robots with UWB tags, one with a camera.
 
-Whatever can say its attitude, velocity, height and range to a peer can be labelled.
+Any robot that logs its attitude, velocity, height and range to a peer can be labelled.
 Run it in an empty folder: python other_robot.py
 """
 
@@ -11,7 +11,7 @@ from dmrl.geometry.frames import Camera
 
 rng = np.random.default_rng(2)
 time_s = np.arange(0.0, 60.0, 0.02)
-# Each drives a figure of its own, and turns as it drives: yaw is along its velocity.
+# Each robot drives its own path, with its yaw along its velocity.
 paths = {
     "rover": np.stack([1.5 * np.sin(0.30 * time_s), 1.0 * np.sin(0.45 * time_s)]),
     "carrier": np.stack([3.0 + np.cos(0.35 * time_s), 1.2 * np.sin(0.25 * time_s)]),

@@ -1,4 +1,4 @@
-"""An Arrow dataset in a training loop of one's own: no trainer, no network of dmrl's.
+"""Train your own network in your own loop on an Arrow dataset, without dmrl's trainer.
 
 Run it in an empty folder: python own_network.py
 """
@@ -14,7 +14,7 @@ data = dmrl.make_dataset([pictures], "dataset")
 train, test = data["train"], data["test"]
 print(data, len(train), "images to learn from")
 
-# Three convolutions to the grid of 8 x 8 pixel cells: a confidence and a depth for each cell.
+# Three convolutions give a confidence and a depth for each cell of 8 x 8 pixels.
 torch.manual_seed(1)
 network = nn.Sequential(
     nn.Conv2d(3, 16, 5, stride=4, padding=2),
@@ -24,7 +24,7 @@ network = nn.Sequential(
     nn.Conv2d(32, 2, 3, padding=1),
 )
 optimizer = torch.optim.Adam(network.parameters(), 3e-3)
-# A robot is in one cell of a thousand.
+# About one cell in a thousand shows a robot, so positive cells get more weight.
 confidence_loss = nn.BCEWithLogitsLoss(pos_weight=torch.tensor(200.0))
 
 for epoch in range(3):

@@ -1,4 +1,4 @@
-"""Ranges and odometry from CSV files of one's own, to positions of peers with their sigma.
+"""Turn ranges and odometry in your own CSV files into positions of peers with their sigma.
 
 Run it in an empty folder: python own_ranges.py
 """
@@ -10,8 +10,8 @@ import numpy as np
 
 import dmrl
 
-# Two robots for 60 s: what a lab's own logger may have written. Velocities are in the world's
-# frame, angles in degrees, distances in millimetres: the table below says so.
+# The logs of two robots over 60 s, as a lab's own logger may write them. Velocities are in the
+# world frame, angles in degrees and ranges in millimetres, as the table of columns below states.
 rng = np.random.default_rng(1)
 time_s = np.arange(0.0, 60.0, 0.02)
 paths = {

@@ -1,4 +1,4 @@
-"""Detections of a network in a ROS 2 bag, read back with rosbags, which needs no ROS.
+"""Write detections of a network to a ROS 2 bag, and read it with rosbags, which needs no ROS.
 
 Needs ``pip install 'dmrl[ros]'``. Run it in an empty folder: python ros2_detections.py
 """
