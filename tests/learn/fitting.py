@@ -1,4 +1,4 @@
-"""Small trainings on images of a dot."""
+"""Short trainings on small images of one bright square."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -29,8 +29,11 @@ EVERYTHING = TrainConfig(
 )
 
 
-def dots(count: int) -> ExampleSet:
-    """Dark images with one bright square, labelled at its centre, depth 1.5 m."""
+def draw_dots(count: int) -> ExampleSet:
+    """Return dark images, 32 x 48 px, of one bright square labelled at its centre, 1.5 m away.
+
+    The images lie in two arrays; labels alternate between classes 0 and 1.
+    """
     rng = np.random.default_rng(0)
     pixels = rng.integers(0, 40, (count, 32, 48, 3), np.uint8)
     robots = np.zeros((count, 1, len(ROBOT_FIELDS)), np.float32)
@@ -42,9 +45,10 @@ def dots(count: int) -> ExampleSet:
     return ExampleSet([pixels[:7], pixels[7:]], robots)
 
 
-def trained(
+def train(
     examples: ExampleSet, folder: Path, settings: TrainConfig = SETTINGS, *, resume: bool = False
 ) -> tuple[Trainer, Network]:
+    """Train to the last epoch and save the model in a folder; return the trainer and network."""
     folder.mkdir(exist_ok=True)
     network = build_initial_network(settings, examples)
     training = Trainer(network, examples, settings, folder, identity="dots", resume=resume)

@@ -1,4 +1,4 @@
-"""Images of bright squares, and what varies them."""
+"""Images of bright squares, and augmentations of them."""
 
 import numpy as np
 
@@ -9,11 +9,14 @@ GEOMETRY = Augmentation(
     flip_share=0.5, zoom=(0.6, 1.6), rotation_deg=15.0, mosaic_share=0.5, paste=1.0
 )
 SIDE_M = 12.0
-"""A square of s pixels stands for a robot at a depth of SIDE_M / s."""
+"""A square with sides of s pixels stands for a robot at a depth of SIDE_M / s."""
 
 
-def squares(count: int = 24, seed: int = 0) -> ExampleSet:
-    """Dark images with one bright square each; its side tells its depth."""
+def draw_squares(count: int = 24, seed: int = 0) -> ExampleSet:
+    """Return dark images, 112 x 160 px, of one bright square each, whose side gives its depth.
+
+    Each label has a second, empty robot. Its sigmas are 1 px and 0.1 m.
+    """
     rng = np.random.default_rng(seed)
     pixels = np.zeros((count, 112, 160, 3), np.uint8)
     robots = np.full((count, 2, len(ROBOT_FIELDS)), np.nan, np.float32)
@@ -26,13 +29,14 @@ def squares(count: int = 24, seed: int = 0) -> ExampleSet:
     return ExampleSet([pixels], robots)
 
 
-def batches(settings: Augmentation, count: int = 10) -> list[Batch]:
-    augmenter = Augmenter(squares(), settings, seed=0)
-    return [augmenter.augment_batch(range(24), epoch=0, index=k) for k in range(count)]
+def augment_batches(settings: Augmentation, count: int = 10) -> list[Batch]:
+    """Return augmented batches of all 24 squares."""
+    maker = Augmenter(draw_squares(), settings, seed=0)
+    return [maker.augment_batch(range(24), epoch=0, index=k) for k in range(count)]
 
 
-def augmenter(**settings: object) -> Augmenter:
-    """Of robots 1 and 4 m away."""
-    examples = squares(2)
+def build_augmenter(**settings: object) -> Augmenter:
+    """Return an augmenter of two squares, labelled 1 and 4 m away, by fields of Augmentation."""
+    examples = draw_squares(2)
     examples.robots[:, 0, 2] = 1.0, 4.0
     return Augmenter(examples, Augmentation(**settings), seed=0)  # type: ignore[arg-type]

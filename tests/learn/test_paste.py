@@ -1,4 +1,4 @@
-"""Robots pasted into other images, and images beside each other."""
+"""Patches of robots pasted into other images, and mosaics of images."""
 
 from dataclasses import replace
 
@@ -12,7 +12,7 @@ from dmrl.learn.data.augment import Augmentation, Augmenter
 from dmrl.learn.data.batches import ROBOT_FIELDS, ExampleSet
 from dmrl.learn.data.crops import Point, RobotRow, apply_homography, build_feather_mask
 
-from .squares import GEOMETRY, augmenter, batches, squares
+from .squares import GEOMETRY, augment_batches, build_augmenter, draw_squares
 
 
 @pytest.mark.heavy
@@ -20,7 +20,9 @@ from .squares import GEOMETRY, augmenter, batches, squares
 def test_pasted_robots_are_labelled_and_covered_ones_are_not(
     intrinsics: tuple[float, float, float, float] | None,
 ) -> None:
-    for batch in batches(replace(GEOMETRY, rotation_deg=0.0, paste=2.0, intrinsics=intrinsics)):
+    for batch in augment_batches(
+        replace(GEOMETRY, rotation_deg=0.0, paste=2.0, intrinsics=intrinsics)
+    ):
         bright = batch.images[:, 0].numpy()
         for image, robots in zip(bright, batch.robots.numpy(), strict=True):
             for robot in robots[np.isfinite(robots[:, 0])]:
@@ -33,31 +35,32 @@ def test_robot_with_a_mask_is_pasted_without_background(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(augment, "DISTRACTOR_FRACTION", 0.0)
-    plain = squares()
+    plain = draw_squares()
     grey = np.maximum(plain.pixels[0], 60)
     masks = (grey[..., 0] == 255).astype(np.uint8)
     settings = replace(Augmentation(), paste=1.0)
     canvases = []
     for known in ([], [masks, np.zeros_like(masks)]):
-        examples = ExampleSet([grey, np.zeros_like(grey)], squares_and_nothing(plain), known)
+        examples = ExampleSet([grey, np.zeros_like(grey)], add_empty_robots(plain), known)
         canvases.append(
             Augmenter(examples, settings, seed=0).augment_batch(range(24, 48), epoch=0, index=0)
         )
     around, cut = (batch.images[:, 0].numpy() for batch in canvases)
     assert ((around > 50) & (around < 70)).sum() > 500
-    # Between robot and canvas there is only the pixel of the mask's edge.
+    # Only the pixels at the edge of the mask mix robot and canvas.
     assert ((cut > 50) & (cut < 70)).sum() < 0.1 * (cut > 200).sum()
     for image, robots in zip(cut, canvases[1].robots.numpy(), strict=True):
         for robot in robots[np.isfinite(robots[:, 0])]:
             assert image[int(robot[1]), int(robot[0])] > 200
 
 
-def squares_and_nothing(plain: ExampleSet) -> NDArray[np.float32]:
+def add_empty_robots(plain: ExampleSet) -> NDArray[np.float32]:
+    """Return the robots of a set, followed by as many images without robots."""
     return np.concatenate([plain.robots, np.full_like(plain.robots, np.nan)])
 
 
 def test_labels_per_augmented_image_are_limited() -> None:
-    crowd = squares(1)
+    crowd = draw_squares(1)
     robots = np.repeat(crowd.robots[:, :1], augment.MAX_ROBOTS_PER_IMAGE + 3, axis=1)
     maker = Augmenter(ExampleSet(crowd.pixels, robots), Augmentation(flip_share=0.5), seed=0)
     batch = maker.augment_batch([0], epoch=0, index=0)
@@ -66,7 +69,11 @@ def test_labels_per_augmented_image_are_limited() -> None:
 
 
 class Patches:
-    """Patches that one augmenter would show: rectangle, source, window and opacity of each."""
+    """The patches that an augmenter pastes into 300 canvases, recorded instead of drawn.
+
+    Of each patch: its rectangle, its source image, the source pixel at its middle, its zoom and
+    the robots it may show.
+    """
 
     def __init__(self, maker: Augmenter, monkeypatch: pytest.MonkeyPatch) -> None:
         self.rects: list[tuple[int, int, int, int]] = []
@@ -97,19 +104,24 @@ class Patches:
             maker._paste_patch(canvas, [], rng)
 
 
-def boxed() -> ExampleSet:
-    """Two images; only in the second is a robot whose box is known, 24 x 10 px about (70, 33)."""
+def build_boxed_examples() -> ExampleSet:
+    """Return two images of 112 x 160 px with a robot each.
+
+    Only the robot of the second image has a box: 24 x 10 px about (70, 33).
+    """
     robots = np.full((2, 2, len(ROBOT_FIELDS)), np.nan, np.float32)
     robots[0, 0, :6] = 30, 30, 2, 0, 0, 0
     robots[1, 1, :10] = 71, 30, 2, 0, 0, 0, 58, 28, 82, 38
     return ExampleSet([np.zeros((2, 112, 160, 3), np.uint8)], robots)
 
 
-def test_a_patch_is_a_quarter_larger_than_its_robot_and_lies_anywhere(
+def test_patch_is_a_quarter_larger_than_its_robot_and_pasted_anywhere(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(augment, "DISTRACTOR_FRACTION", 0.0)
-    found = Patches(Augmenter(boxed(), Augmentation(zoom=(0.5, 2.0)), seed=0), monkeypatch)
+    found = Patches(
+        Augmenter(build_boxed_examples(), Augmentation(zoom=(0.5, 2.0)), seed=0), monkeypatch
+    )
     assert len(found.rects) == 300 and set(found.sources) == {1}
     assert (min(found.zooms), max(found.zooms)) == pytest.approx((1 / 1.1, 1.1), abs=0.004)
     rects, zooms = np.array(found.rects), np.array(found.zooms)[:, None]
@@ -126,9 +138,11 @@ def test_a_patch_is_a_quarter_larger_than_its_robot_and_lies_anywhere(
     assert all(len(mine) == 1 and mine[0][0] == 71 for mine in found.mine)
 
 
-def test_some_patches_show_any_place_of_any_image(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_distractor_patches_come_from_anywhere_in_any_image(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(augment, "DISTRACTOR_FRACTION", 1.0)
-    found = Patches(Augmenter(boxed(), Augmentation(), seed=0), monkeypatch)
+    found = Patches(Augmenter(build_boxed_examples(), Augmentation(), seed=0), monkeypatch)
     assert np.mean(found.sources) == pytest.approx(0.5, abs=0.06)
     assert {
         (source, mine[0][0]) for source, mine in zip(found.sources, found.mine, strict=True)
@@ -140,19 +154,20 @@ def test_some_patches_show_any_place_of_any_image(monkeypatch: pytest.MonkeyPatc
     assert middles.min(axis=0) == pytest.approx([0, 0], abs=2)
     assert middles.max(axis=0) == pytest.approx([160, 112], abs=2)
     monkeypatch.setattr(augment, "DISTRACTOR_FRACTION", 0.25)
-    shares = Patches(Augmenter(boxed(), Augmentation(), seed=0), monkeypatch)
+    shares = Patches(Augmenter(build_boxed_examples(), Augmentation(), seed=0), monkeypatch)
     assert np.mean(shares.sources) == pytest.approx(1 - 0.25 / 2, abs=0.06)
 
 
 def test_a_robot_too_large_for_the_canvas_is_not_pasted(monkeypatch: pytest.MonkeyPatch) -> None:
-    for width, count in ((121.6, 300), (121.7, 0)):  # a quarter more, and eight
-        examples = boxed()
+    # A patch is 1.25 times the box and 8 px wider: 160 px, the canvas, at 121.6 px.
+    for width, count in ((121.6, 300), (121.7, 0)):
+        examples = build_boxed_examples()
         examples.robots[1, 1, 6:10] = 0, 20, width, 40
         assert len(Patches(Augmenter(examples, Augmentation(), seed=0), monkeypatch).rects) == count
 
 
 def test_a_mosaic_shows_other_images_in_its_other_parts(monkeypatch: pytest.MonkeyPatch) -> None:
-    maker = Augmenter(squares(5), Augmentation(mosaic_share=0.5), seed=0)
+    maker = Augmenter(draw_squares(5), Augmentation(mosaic_share=0.5), seed=0)
     rng, shown = np.random.default_rng(3), []
     monkeypatch.setattr(
         maker, "_draw_layer", lambda _, rect, source, *rest: shown.append((rect, source))
@@ -172,7 +187,7 @@ def test_a_mosaic_shows_other_images_in_its_other_parts(monkeypatch: pytest.Monk
 
 
 def test_patch_probability_is_met(monkeypatch: pytest.MonkeyPatch) -> None:
-    maker, rng, asked = augmenter(paste=1.5), np.random.default_rng(3), []
+    maker, rng, asked = build_augmenter(paste=1.5), np.random.default_rng(3), []
     monkeypatch.setattr(maker, "_paste_patch", lambda canvas, robots, _: asked.append(1) or robots)
     for _ in range(400):
         maker._draw_canvas(np.zeros((112, 160, 3), np.uint8), 0, rng)
@@ -180,8 +195,9 @@ def test_patch_probability_is_met(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_patches_are_pasted_at_every_position(monkeypatch: pytest.MonkeyPatch) -> None:
-    examples = boxed()
-    examples.robots[1, 1, 6:10] = 20, 20, 135, 100  # with its margin 152 x 108 of 160 x 112
+    examples = build_boxed_examples()
+    # With its margin the patch takes 152 x 108 of 160 x 112 px.
+    examples.robots[1, 1, 6:10] = 20, 20, 135, 100
     found = Patches(Augmenter(examples, Augmentation(), seed=0), monkeypatch)
     assert {rect[0] for rect in found.rects} == set(range(9))
     assert {rect[1] for rect in found.rects} == set(range(5))

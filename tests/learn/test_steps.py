@@ -1,4 +1,4 @@
-"""The steps of a training: which images they take, at which rate, and what is shown of them."""
+"""Training steps: their images, learning rates, losses and logged curves."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
@@ -16,10 +16,10 @@ from dmrl.learn.training import trainer
 from dmrl.learn.training.train_step import LOSS_NAMES, compute_losses, train_step
 from dmrl.learn.training.trainer import Trainer, build_initial_network, learning_rate_at
 
-from .fitting import PUBLISHED, SETTINGS, dots
+from .fitting import PUBLISHED, SETTINGS, draw_dots
 
 
-def test_the_learning_rate_rises_for_two_epochs_and_falls_to_its_end() -> None:
+def test_published_learning_rate_rises_for_two_epochs_and_then_falls() -> None:
     rates = [learning_rate_at(step, 100, PUBLISHED) for step in range(1, 1501)]
     assert rates[0] == pytest.approx(1e-3 / 200)
     assert rates[99] == pytest.approx(0.5e-3)
@@ -62,7 +62,7 @@ def test_epochs_differ_in_order_and_are_reproducible(examples: ExampleSet, tmp_p
 
 
 @pytest.mark.heavy
-def test_an_epoch_of_so_many_images_takes_as_many_steps_of_few(
+def test_epoch_images_set_the_steps_of_an_epoch_of_a_small_set(
     examples: ExampleSet, tmp_path: Path
 ) -> None:
     settings = replace(SETTINGS, epochs=2, epoch_images=3 * SETTINGS.batch_size + 1)
@@ -82,7 +82,7 @@ def test_reported_loss_is_the_mean_since_the_last_report(
     settings = replace(SETTINGS, epochs=2)
     training = Trainer(build_initial_network(settings, examples), examples, settings, tmp_path)
     shown = [step.loss for step in training.train_steps()]
-    # Seven batches of an epoch, the last of two images: looked at once, at its end.
+    # An epoch has seven batches, the last of two images, and reports once, at its end.
     assert [shown[6], shown[13]] == pytest.approx([epoch["loss"] for epoch in training.history])
 
 
@@ -97,9 +97,10 @@ def test_logged_curves_have_the_right_step_numbers(
         yield lambda *row: rows.append(row)
 
     monkeypatch.setattr(trainer.boards, "open_log", opened)
-    settings, images = replace(SETTINGS, epochs=2), dots(7)  # three steps, the last of one image
+    # An epoch of 7 images has three steps, the last of one image.
+    settings, images = replace(SETTINGS, epochs=2), draw_dots(7)
     network = build_initial_network(settings, images)
-    training = Trainer(network, images, settings, tmp_path, validation=dots(3))
+    training = Trainer(network, images, settings, tmp_path, validation=draw_dots(3))
     assert training.steps_left == 6
     assert [step.epoch for step in training.train_steps()] == [1, 1, 1, 2, 2, 2]
     assert training.steps_left == 0
@@ -124,8 +125,8 @@ def test_logged_curves_have_the_right_step_numbers(
 def test_trainer_passes_recipe_settings_to_each_step(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Nothing is computed here: what each step of three epochs would be given."""
-    images, asked = dots(8), []
+    """Replaced steps record what each of three epochs would give them, and compute nothing."""
+    images, asked = draw_dots(8), []
     settings = replace(SETTINGS, epochs=3, frozen_norm_epochs=1, ema_steps=5, hard_share=0.25)
     teacher = build_network("dmrl-nano").train()
 
@@ -176,7 +177,7 @@ def test_trainer_passes_recipe_settings_to_each_step(
 
 
 @pytest.mark.parametrize("warmup", [0, 1, 2])
-def test_learning_rates_are_a_line_and_half_a_cosine(warmup: int) -> None:
+def test_learning_rate_is_a_linear_warmup_and_half_a_cosine(warmup: int) -> None:
     settings = replace(
         SETTINGS, epochs=4, warmup_epochs=warmup, learning_rate=0.5, final_learning_rate=0.1
     )

@@ -12,11 +12,14 @@ from dmrl.learn.data.batches import ROBOT_FIELDS, Batch, ExampleSet
 from dmrl.learn.data.crops import RobotRow, apply_homography, rotation_to_pixel
 from dmrl.learn.training.config import TrainConfig
 
-from ..squares import GEOMETRY, SIDE_M, augmenter, batches, squares
+from ..squares import GEOMETRY, SIDE_M, augment_batches, build_augmenter, draw_squares
 
 
-def lonely(batch: Batch) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
-    """Image and robot where there is one robot and it is whole and far from the rim."""
+def select_single_robots(batch: Batch) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
+    """Return (first channel (112, 160), robot) of images with one whole robot.
+
+    The robot must be at least one and a half times its half side from the edge.
+    """
     out = []
     for image, robots in zip(batch.images.numpy(), batch.robots.numpy(), strict=True):
         found = robots[np.isfinite(robots[:, 0])].astype(np.float64)
@@ -33,8 +36,8 @@ def lonely(batch: Batch) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]
 def test_labels_stay_at_the_robots_and_depth_follows_the_zoom() -> None:
     settings = replace(GEOMETRY, mosaic_share=0.0, paste=0.0)
     checked = 0
-    for batch in batches(settings, 30):
-        for image, robot in lonely(batch):
+    for batch in augment_batches(settings, 30):
+        for image, robot in select_single_robots(batch):
             mass = image.sum()
             v, u = np.indices(image.shape) + 0.5
             at = np.array([(u * image).sum(), (v * image).sum()]) / mass
@@ -48,7 +51,8 @@ def test_labels_stay_at_the_robots_and_depth_follows_the_zoom() -> None:
 @pytest.mark.heavy
 def test_depths_stay_in_the_range_of_the_labels() -> None:
     depths = [
-        batch.robots[..., 2] for batch in batches(replace(GEOMETRY, zoom=(0.2, 5.0), paste=0.0))
+        batch.robots[..., 2]
+        for batch in augment_batches(replace(GEOMETRY, zoom=(0.2, 5.0), paste=0.0))
     ]
     found = torch.cat(depths).flatten()
     found = found[torch.isfinite(found)]
@@ -60,7 +64,7 @@ def test_depths_stay_in_the_range_of_the_labels() -> None:
 
 @pytest.mark.heavy
 def test_sigmas_follow_the_zoom() -> None:
-    for batch in batches(replace(GEOMETRY, mosaic_share=0.0, paste=0.0), 3):
+    for batch in augment_batches(replace(GEOMETRY, mosaic_share=0.0, paste=0.0), 3):
         robots = batch.robots[torch.isfinite(batch.robots[..., 0])]
         zoom = robots[:, 3]
         assert zoom.min() < 1.1 < 1.3 < zoom.max()
@@ -68,8 +72,8 @@ def test_sigmas_follow_the_zoom() -> None:
         torch.testing.assert_close(robots[:, 5], 0.1 / zoom)
 
 
-def test_a_batch_depends_on_seed_epoch_and_place_alone() -> None:
-    examples = squares()
+def test_a_batch_depends_only_on_seed_epoch_and_index() -> None:
+    examples = draw_squares()
     everything = replace(GEOMETRY, colour=0.1, noise=0.05, blur_share=0.5)
     first, again = (Augmenter(examples, everything, seed=3) for _ in range(2))
     first.augment_batch([5], epoch=0, index=0)
@@ -80,7 +84,7 @@ def test_a_batch_depends_on_seed_epoch_and_place_alone() -> None:
     assert not torch.equal(a.images, other.images)
 
 
-def test_images_without_robots_or_boxes_can_be_varied_too() -> None:
+def test_images_without_robots_can_be_augmented() -> None:
     empty = ExampleSet(
         [np.zeros((2, 112, 160, 3), np.uint8)],
         np.full((2, 1, len(ROBOT_FIELDS)), np.nan, np.float32),
@@ -104,7 +108,8 @@ def test_noise_differs_between_epochs_and_stays_below_its_std() -> None:
     first, second = (maker.augment_batch([0] * 8, epoch=epoch, index=0).images for epoch in (0, 1))
     assert not torch.equal(first, second)
     loud = first.float().sub(128).std(dim=(1, 2, 3)) / 255
-    assert 0.5 * 0.05 < loud.max() < 1.02 * 0.05  # anything up to what is asked for
+    # Each image draws its standard deviation, up to the configured one.
+    assert 0.5 * 0.05 < loud.max() < 1.02 * 0.05
 
 
 def test_every_augmentation_key_changes_its_own_property() -> None:
@@ -127,14 +132,17 @@ def test_every_augmentation_key_changes_its_own_property() -> None:
 @pytest.mark.heavy
 def test_a_grey_share_of_images_has_no_colours() -> None:
     settings = Augmentation(colour=0.2, noise=0.02, grey_share=0.5)
-    images = torch.cat([batch.images for batch in batches(settings)]).float()
+    images = torch.cat([batch.images for batch in augment_batches(settings)]).float()
     grey = (images.amax(dim=1) == images.amin(dim=1)).flatten(1).all(dim=1)
     assert 0.4 < grey.float().mean() < 0.6
-    whole = torch.cat([batch.images for batch in batches(replace(settings, grey_share=1.0), 1)])
+    whole = torch.cat(
+        [batch.images for batch in augment_batches(replace(settings, grey_share=1.0), 1)]
+    )
     assert (whole.amax(dim=1) == whole.amin(dim=1)).all()
 
 
-def at_depth(depth_m: float) -> RobotRow:
+def build_robot(depth_m: float) -> RobotRow:
+    """Return a label row that knows only its depth."""
     return [0.0, 0.0, depth_m, *[0.0] * (len(ROBOT_FIELDS) - 3)]
 
 
@@ -142,37 +150,37 @@ def at_depth(depth_m: float) -> RobotRow:
     ("depth_m", "low", "high"),
     [
         (None, 0.25, 8.0),
-        (2.0, 2 / 4.4, 2.2),  # between 1 m less a tenth and 4 m more
+        (2.0, 2 / 4.4, 2.2),  # to 1 m less a tenth and to 4 m plus a tenth
         (1.0, 0.25, 1.1),
         (4.0, 4 / 4.4, 4.4),
-        (0.5, 0.25, 1.0),  # nearer than any label: not nearer still
+        (0.5, 0.25, 1.0),  # it is nearer than any label, so it comes no nearer
         (9.0, 1.0, 8.0),
     ],
 )
-def test_zooms_keep_a_robot_among_the_depths_of_the_labels(
+def test_zoom_keeps_depths_within_the_range_of_the_labels(
     depth_m: float | None, low: float, high: float
 ) -> None:
-    maker, rng = augmenter(zoom=(0.25, 8.0)), np.random.default_rng(1)
-    robot = None if depth_m is None else at_depth(depth_m)
+    maker, rng = build_augmenter(zoom=(0.25, 8.0)), np.random.default_rng(1)
+    robot = None if depth_m is None else build_robot(depth_m)
     drawn = np.log([maker._sample_zoom(robot, rng) for _ in range(2000)])
     assert np.exp(drawn.min()) == pytest.approx(low, rel=0.02)
     assert np.exp(drawn.max()) == pytest.approx(high, rel=0.02)
     assert drawn.mean() == pytest.approx((np.log(low) + np.log(high)) / 2, abs=0.1)
 
 
-def test_turns_go_either_way_and_some_are_mirrored() -> None:
-    maker, rng = augmenter(rotation_deg=20.0, flip_share=0.25), np.random.default_rng(2)
+def test_rotations_have_both_signs_and_a_share_is_mirrored() -> None:
+    maker, rng = build_augmenter(rotation_deg=20.0, flip_share=0.25), np.random.default_rng(2)
     turns = np.array([maker._sample_rotation(2.0, rng) for _ in range(2000)])
     assert np.linalg.det(turns) == pytest.approx(np.where(np.linalg.det(turns) > 0, 0.25, -0.25))
     assert (np.linalg.det(turns) < 0).mean() == pytest.approx(0.25, abs=0.03)
-    # The second column is turned and not mirrored.
+    # A mirror changes the first column only, so the second gives the angle.
     angle = np.degrees(np.arctan2(-turns[:, 0, 1], turns[:, 1, 1]))
     assert (angle.min(), angle.max()) == pytest.approx((-20, 20), abs=0.2)
     assert angle.mean() == pytest.approx(0, abs=1)
 
 
-def test_a_tint_changes_contrast_about_the_middle_and_brightness() -> None:
-    maker, rng = augmenter(colour=0.1), np.random.default_rng(3)
+def test_colour_jitter_changes_brightness_and_contrast_about_mid_grey() -> None:
+    maker, rng = build_augmenter(colour=0.1), np.random.default_rng(3)
     grey, bright = [], []
     for _ in range(3000):
         pixels = np.array([[[128] * 3, [178] * 3]], np.uint8)
@@ -180,7 +188,7 @@ def test_a_tint_changes_contrast_about_the_middle_and_brightness() -> None:
         grey.append(pixels[0, 0])
         bright.append((pixels[0, 1] - pixels[0, 0]) / 50)
     assert np.std(grey, axis=0) == pytest.approx([12.8] * 3, rel=0.06)
-    assert np.ptp(grey, axis=1).max() == 0  # the middle is lifted, not coloured
+    assert np.ptp(grey, axis=1).max() == 0  # Mid-grey becomes lighter or darker, not coloured.
     gain = np.log(bright)
     assert gain.mean(axis=1).std() == pytest.approx(np.hypot(0.1, 0.05 / 3**0.5), rel=0.06)
     assert (gain - gain.mean(axis=1, keepdims=True)).std() == pytest.approx(
@@ -189,13 +197,13 @@ def test_a_tint_changes_contrast_about_the_middle_and_brightness() -> None:
 
 
 def test_defocus_blurs_a_point_symmetrically() -> None:
-    maker, rng, middles = augmenter(blur_share=0.5), np.random.default_rng(4), []
+    maker, rng, middles = build_augmenter(blur_share=0.5), np.random.default_rng(4), []
     for _ in range(600):
         canvas = np.zeros((7, 9, 3), np.uint8)
         canvas[3, 4] = 250
         maker._degrade_image(canvas, rng)
         seen = canvas[..., 0].astype(int)
-        assert seen.sum() == pytest.approx(250, abs=4.5)  # nine that are rounded
+        assert seen.sum() == pytest.approx(250, abs=4.5)  # Nine pixels are rounded.
         assert (seen == seen[::-1]).all() and (seen == seen[:, ::-1]).all()
         assert not seen[:, [0, 1, 2, 6, 7, 8]].any() and not seen[[0, 1, 5, 6]].any()
         middles.append(float(np.sqrt(seen[3, 4] / 250)))
@@ -210,9 +218,9 @@ def test_without_geometry_keeps_photometric_settings_only() -> None:
     assert every.without_geometry == wanted
 
 
-def test_camera_turn_keeps_a_quarter_of_the_depth() -> None:
+def test_camera_is_turned_only_where_depths_keep_a_quarter_of_the_largest() -> None:
     camera, rng = (60.0, 64.0, 80.0, 56.0), np.random.default_rng(5)
-    maker, kept = augmenter(intrinsics=camera), []
+    maker, kept = build_augmenter(intrinsics=camera), []
     k = np.array([[60.0, 0, 80], [0, 64, 56], [0, 0, 1]])
     for _ in range(300):
         left, top = rng.integers(0, 60, 2).tolist()
@@ -230,15 +238,15 @@ def test_camera_turn_keeps_a_quarter_of_the_depth() -> None:
         kept.append(window.camera is not None)
         assert kept[-1] == (ahead.min() > 0.25 * ahead.max())
         found = apply_homography(window.matrix.tolist(), *shown)
-        assert found == pytest.approx(seen, abs=1e-6)  # as far as it is shown where it should be
+        assert found == pytest.approx(seen, abs=1e-6)
     assert 0.2 < np.mean(kept) < 0.9
 
 
-def test_a_window_is_turned_about_where_the_robot_comes_to_be(
+def test_window_is_turned_about_the_new_position_of_the_robot(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     maker, rng, asked = (
-        augmenter(zoom=(1.0, 2.0), rotation_deg=20.0, flip_share=0.5),
+        build_augmenter(zoom=(1.0, 2.0), rotation_deg=20.0, flip_share=0.5),
         np.random.default_rng(6),
         [],
     )
@@ -253,14 +261,18 @@ def test_a_window_is_turned_about_where_the_robot_comes_to_be(
             np.testing.assert_allclose(seen, robot[:2])
             np.testing.assert_allclose(found[0][:2], shown, atol=1e-3)
             shown_at.append(shown)
-    assert len(shown_at) > 40  # most windows hold the robot
-    assert np.std(shown_at, axis=0).min() > 2  # not always at one place
+    assert len(shown_at) > 40  # Most windows show the robot.
+    assert np.std(shown_at, axis=0).min() > 2  # The position varies.
 
 
-def layered(
+def draw_layers(
     maker: Augmenter, rect: tuple[int, int, int, int], monkeypatch: pytest.MonkeyPatch, focus: float
 ) -> list[tuple[float, NDArray[np.float64], NDArray[np.float64]]]:
-    """Zoom of many windows of the first image, what they show of it, and where its robot comes."""
+    """Return (zoom, corners (2, 2), position (2,) of its robot) of 300 windows of the first image.
+
+    Corners are pixels of the source; the position is in pixels of the window. A share `focus` of
+    the windows must show the robot.
+    """
     monkeypatch.setattr(augment, "FOCUS_FRACTION", focus)
     asked: list[tuple[NDArray[np.float64], float, NDArray[np.float64], NDArray[np.float64]]] = []
     made = maker._build_window
@@ -287,19 +299,20 @@ def layered(
 def test_crop_windows_cover_their_source_without_leaving_it(
     rect: tuple[int, int, int, int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    maker = augmenter(zoom=(1.5, 2.5))
+    maker = build_augmenter(zoom=(1.5, 2.5))
     maker._examples.robots[0, 0, :3] = 90.0, 40.0, 2.0
     size, whole = np.array([rect[2] - rect[0], rect[3] - rect[1]]), np.array([160, 112])
     for focus in (0.0, 1.0):
-        found = layered(maker, rect, monkeypatch, focus)
+        found = draw_layers(maker, rect, monkeypatch, focus)
         zooms = np.array([zoom for zoom, _, _ in found])
-        assert (zooms.min(), zooms.max()) == pytest.approx((1.5, 2.2), abs=0.02)  # to 1.1 m less
+        # At zoom 2.2 the robot, 2 m away, is a tenth nearer than the nearest label of 1 m.
+        assert (zooms.min(), zooms.max()) == pytest.approx((1.5, 2.2), abs=0.02)
         low, high = (np.array([corners[k] for _, corners, _ in found]) for k in (0, 1))
         assert high - low == pytest.approx(size / zooms[:, None])
         assert (low > -1e-9).all() and (high < whole + 1e-9).all()
         at = np.array([place for _, _, place in found])
         held = ((at >= 0) & (at <= size)).all(axis=1)
-        # Evenly over where it may be: the least and the most there is.
+        # Windows are spread evenly over all positions that they may take.
         place = low / (whole - (high - low))
         if focus:
             assert held.all()
@@ -314,17 +327,17 @@ def test_crop_windows_cover_their_source_without_leaving_it(
 
 
 @pytest.mark.heavy
-def test_a_window_is_no_smaller_than_its_source_lets_it_be(
+def test_zoom_is_limited_so_that_a_window_stays_within_its_source(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     for rect, least in (((0, 0, 160, 112), 1.0), ((0, 0, 80, 112), 1.0), ((0, 0, 120, 28), 0.75)):
-        found = layered(augmenter(zoom=(0.1, 0.2)), rect, monkeypatch, 0.0)
+        found = draw_layers(build_augmenter(zoom=(0.1, 0.2)), rect, monkeypatch, 0.0)
         assert {zoom for zoom, _, _ in found} == {least}
 
 
 @pytest.mark.heavy
 def test_noise_pattern_starts_at_a_random_offset() -> None:
-    maker, rng = augmenter(noise=0.1), np.random.default_rng(4)
+    maker, rng = build_augmenter(noise=0.1), np.random.default_rng(4)
     assert len(maker._grain) == 2 * 112 * 160 * 3
     assert maker._grain.std() == pytest.approx(1, abs=0.01)
     canvases = []
@@ -332,10 +345,11 @@ def test_noise_pattern_starts_at_a_random_offset() -> None:
         canvases.append(np.full((112, 160, 3), 128, np.uint8))
         maker._degrade_image(canvases[-1], rng)
     noise = np.array(canvases).reshape(40, -1) - 128.0
-    assert np.abs(noise.mean(axis=1)).max() < 0.5  # rounded, not cut off
+    # Noise is rounded to the nearest integer, so it has no bias.
+    assert np.abs(noise.mean(axis=1)).max() < 0.5
     loud = noise.std(axis=1) / 25.5
     assert 0 <= loud.min() < 0.3 and 0.7 < loud.max() <= 1.01
-    # Where along the grain the first pixels of a canvas are.
+    # Find the offset into the pattern from the first pixels of each canvas.
     views = np.lib.stride_tricks.sliding_window_view(maker._grain, 12)
     begun = {
         int((views @ row[:12]).argmax()) for row, s in zip(noise, loud, strict=True) if s > 0.3

@@ -9,8 +9,8 @@ from dmrl.learn.data.targets import LabelNoise, build_targets, build_teacher_tar
 SHAPE = (28, 40)
 
 
-def robots(*rows: tuple[float, ...]) -> torch.Tensor:
-    """(1, K, 11) from u, v, depth and, where given, sigmas."""
+def build_robots(*rows: tuple[float, ...]) -> torch.Tensor:
+    """Return labels (1, n, fields) from rows of u, v, depth and, if given, sigmas."""
     out = torch.full((1, len(rows), len(ROBOT_FIELDS)), float("nan"))
     for k, row in enumerate(rows):
         out[0, k, 3:6] = 0
@@ -18,13 +18,13 @@ def robots(*rows: tuple[float, ...]) -> torch.Tensor:
     return out
 
 
-def test_without_width_they_are_the_grid_labels_of_the_paper() -> None:
+def test_targets_of_zero_width_equal_the_grid_labels_of_the_paper() -> None:
     rng = np.random.default_rng(0)
     for _ in range(20):
         found = np.c_[rng.uniform(-20, 340, 6), rng.uniform(-20, 240, 6), rng.uniform(0.2, 2, 6)]
-        found[0, :2] = 64, 80  # on a border
-        found[2, :2] = found[1, :2]  # two in one cell
-        got = build_targets(robots(*found), SHAPE, sigma_cells=0)
+        found[0, :2] = 64, 80  # It lies on a border of cells.
+        found[2, :2] = found[1, :2]  # Two share one cell.
+        got = build_targets(build_robots(*found), SHAPE, sigma_cells=0)
         confidence, depth_m = build_grid_label(found[:, :2], found[:, 2])
         np.testing.assert_array_equal(got.confidence[0], confidence)
         np.testing.assert_array_equal(got.weight[0], confidence)
@@ -32,7 +32,7 @@ def test_without_width_they_are_the_grid_labels_of_the_paper() -> None:
 
 
 def test_offset_of_each_near_cell_points_to_the_centre() -> None:
-    got = build_targets(robots((101.5, 50.25, 1.3)), SHAPE, sigma_cells=0.7)
+    got = build_targets(build_robots((101.5, 50.25, 1.3)), SHAPE, sigma_cells=0.7)
     rows, cols = torch.nonzero(got.weight[0], as_tuple=True)
     assert len(rows) > 4
     u = (cols + 0.5 + got.offset[0, 0, rows, cols]) * 8
@@ -44,44 +44,47 @@ def test_offset_of_each_near_cell_points_to_the_centre() -> None:
 
 
 def test_each_cell_belongs_to_the_nearest_centre() -> None:
-    got = build_targets(robots((100, 100, 1.0), (116, 100, 2.0)), SHAPE, sigma_cells=0.7)
+    got = build_targets(build_robots((100, 100, 1.0), (116, 100, 2.0)), SHAPE, sigma_cells=0.7)
     assert got.depth_m[0, 12, 11:16].tolist() == pytest.approx([1, 1, 1, 2, 2])
 
 
-def test_no_robot_is_no_presence_and_no_weight() -> None:
-    got = build_targets(robots((float("nan"), 0, 0), (50, 50, -1)), SHAPE, sigma_cells=0.7)
+def test_without_robots_presence_and_weights_are_zero() -> None:
+    got = build_targets(build_robots((float("nan"), 0, 0), (50, 50, -1)), SHAPE, sigma_cells=0.7)
     assert all((x == 0).all() for x in (got.confidence, got.weight, got.offset))
     assert (got.confidence_weight == 1).all()
     assert all(torch.isfinite(x).all() for x in got if x is not None)
 
 
-def test_a_noisy_label_weighs_less_or_is_spread_out() -> None:
+def test_noisy_labels_weigh_less_or_are_spread_over_cells() -> None:
     exact, noisy = (100.0, 100.0, 1.0), (100.0, 100.0, 1.0, 8.0, 8.0, 0.1)
-    plain = build_targets(robots(noisy), SHAPE, sigma_cells=0.7)
-    for one, other in zip(plain, build_targets(robots(exact), SHAPE, sigma_cells=0.7), strict=True):
+    plain = build_targets(build_robots(noisy), SHAPE, sigma_cells=0.7)
+    for one, other in zip(
+        plain, build_targets(build_robots(exact), SHAPE, sigma_cells=0.7), strict=True
+    ):
         torch.testing.assert_close(one, other)
-    weighted = build_targets(robots(noisy), SHAPE, sigma_cells=0.7, label_noise="weight")
+    weighted = build_targets(build_robots(noisy), SHAPE, sigma_cells=0.7, label_noise="weight")
     torch.testing.assert_close(weighted.weight, plain.weight / 2)
     torch.testing.assert_close(weighted.offset_weight, plain.weight / 2)
     assert weighted.confidence_weight[0, 12, 12] == 0.5
     assert weighted.confidence_weight[0, 0, 0] == 1
-    softened = build_targets(robots(noisy), SHAPE, sigma_cells=0.7, label_noise="soften")
+    softened = build_targets(build_robots(noisy), SHAPE, sigma_cells=0.7, label_noise="soften")
     assert softened.confidence.max() < 0.5 * plain.confidence.max()
-    # Spread, not lost: the sum over cells stays.
+    # Softening spreads presence and keeps its sum over cells.
     torch.testing.assert_close(softened.confidence.sum(), plain.confidence.sum(), rtol=1e-2, atol=0)
 
 
-def test_every_cell_of_a_robot_knows_its_class() -> None:
-    near, far, strange = robots((100, 100, 1.0), (116, 100, 2.0), (200, 50, 1.0))[0].unbind()
+def test_cells_of_a_robot_have_its_class() -> None:
+    near, far, strange = build_robots((100, 100, 1.0), (116, 100, 2.0), (200, 50, 1.0))[0].unbind()
     near[CLASS_ID], far[CLASS_ID] = 0, 1
     got = build_targets(torch.stack((near, far, strange))[None], SHAPE, sigma_cells=0.7)
     assert got.class_id[0, 12, 11:16].tolist() == [0, 0, 0, 1, 1]
-    assert (got.class_id[0, :8] == -1).all()  # neither the strange one nor empty cells
+    # The robot without a class and empty cells have class -1.
+    assert (got.class_id[0, :8] == -1).all()
     assert got.weight[0, 6, 25] > 0
 
 
-def test_a_teacher_is_learnt_where_it_sees_a_robot_and_where_it_doubts() -> None:
-    labelled = build_targets(robots((100, 100, 1.0)), SHAPE, sigma_cells=0.7)
+def test_teacher_targets_take_all_confidences_but_only_sure_positions() -> None:
+    labelled = build_targets(build_robots((100, 100, 1.0)), SHAPE, sigma_cells=0.7)
     said = torch.full((1, 4, *SHAPE), -6.0)
     said[0, :, 3, 5] = torch.tensor([0.5, 2.0, 0.2, -0.1])
     said[0, 1, 9, 9] = -3.0
@@ -94,27 +97,27 @@ def test_a_teacher_is_learnt_where_it_sees_a_robot_and_where_it_doubts() -> None
 
 
 def test_presence_is_a_gaussian_of_the_distance_in_cells() -> None:
-    got = build_targets(robots((100.0, 100.0, 1.0)), SHAPE, sigma_cells=0.7).confidence[0]
+    got = build_targets(build_robots((100.0, 100.0, 1.0)), SHAPE, sigma_cells=0.7).confidence[0]
     for row, col in ((12, 12), (12, 13), (11, 11), (13, 10)):
         away = np.hypot(8 * (col + 0.5) - 100, 8 * (row + 0.5) - 100) / 8
         assert got[row, col] == pytest.approx(np.exp(-0.5 * (away / 0.7) ** 2), rel=1e-5)
 
 
 @pytest.mark.parametrize("times", [0.5, 1.0, 2.0])
-def test_a_label_counts_by_the_square_of_its_sigma(times: float) -> None:
-    noisy = robots((100.0, 100.0, 2.0, 8 * times, 8 * times, 0.3))
+def test_the_weight_of_a_label_falls_with_the_square_of_its_sigma(times: float) -> None:
+    noisy = build_robots((100.0, 100.0, 2.0, 8 * times, 8 * times, 0.3))
     exact = build_targets(noisy, SHAPE, sigma_cells=0.7)
     got = build_targets(noisy, SHAPE, sigma_cells=0.7, label_noise="weight")
     torch.testing.assert_close(got.offset_weight, exact.offset_weight / (1 + times**2))
-    # 0.3 m of 2 m is one and a half times what counts half.
+    # A relative sigma of 0.1 halves the weight; 0.3 m of 2 m is 1.5 times that.
     torch.testing.assert_close(got.weight, exact.weight / (1 + 1.5**2))
 
 
 def test_cells_below_a_tenth_of_presence_learn_no_depth() -> None:
-    """At a width of one cell, exp(-d^2 / 2) is a tenth at d = 2.146 cells."""
+    """With a width of one cell, presence exp(-d^2 / 2) is a tenth at d = 2.146 cells."""
     for off_cells, counts in ((2.1, True), (2.2, False)):
-        centre = 100.0 + 8 * off_cells  # of the cell whose middle is at 100
-        got = build_targets(robots((centre, 100.0, 2.0)), SHAPE, sigma_cells=1.0)
+        centre = 100.0 + 8 * off_cells  # Cell 12 has its middle at 100 px.
+        got = build_targets(build_robots((centre, 100.0, 2.0)), SHAPE, sigma_cells=1.0)
         presence = np.exp(-(off_cells**2) / 2)
         assert float(got.confidence[0, 12, 12]) == pytest.approx(presence, rel=1e-4)
         assert float(got.weight[0, 12, 12]) == pytest.approx(presence * counts, rel=1e-4)
@@ -122,11 +125,11 @@ def test_cells_below_a_tenth_of_presence_learn_no_depth() -> None:
         assert got.offset[0, :, 12, 12].tolist() == pytest.approx([off_cells * counts, 0], abs=1e-4)
 
 
-def test_a_depth_s_sigma_counts_by_its_share_and_only_for_the_depth() -> None:
+def test_the_relative_sigma_of_a_depth_weighs_only_the_depth() -> None:
     exact, blurred = (100.0, 100.0, 2.0, 0, 0, 0.0), (100.0, 100.0, 2.0, 0, 0, 0.2)
     for label_noise, depth, other in (("weight", 0.5, 1.0), ("ignore", 1.0, 1.0)):
         plain, noisy = (
-            build_targets(robots(row), SHAPE, sigma_cells=0.7, label_noise=label_noise)  # type: ignore[arg-type]
+            build_targets(build_robots(row), SHAPE, sigma_cells=0.7, label_noise=label_noise)  # type: ignore[arg-type]
             for row in (exact, blurred)
         )
         torch.testing.assert_close(noisy.weight, depth * plain.weight)
@@ -134,16 +137,16 @@ def test_a_depth_s_sigma_counts_by_its_share_and_only_for_the_depth() -> None:
         torch.testing.assert_close(noisy.confidence_weight, plain.confidence_weight)
 
 
-def test_a_sigma_in_pixels_is_the_root_mean_square_of_both_ways() -> None:
+def test_the_sigma_in_pixels_is_the_root_mean_square_of_both_axes() -> None:
     exact, blurred = (100.0, 100.0, 2.0, 0, 0, 0), (100.0, 100.0, 2.0, 8 * 2**0.5, 0, 0)
     plain, noisy = (
-        build_targets(robots(row), SHAPE, sigma_cells=0.7, label_noise="weight")
+        build_targets(build_robots(row), SHAPE, sigma_cells=0.7, label_noise="weight")
         for row in (exact, blurred)
     )
     torch.testing.assert_close(noisy.offset_weight, 0.5 * plain.offset_weight)
     assert noisy.confidence_weight[0, 12, 12] == pytest.approx(0.5)
-    assert noisy.confidence_weight[0, 0, 0] == 1  # that nobody is there is sure
-    soft = build_targets(robots(blurred), SHAPE, sigma_cells=0.7, label_noise="soften")
+    assert noisy.confidence_weight[0, 0, 0] == 1  # An empty cell is certain.
+    soft = build_targets(build_robots(blurred), SHAPE, sigma_cells=0.7, label_noise="soften")
     wider = (0.49 + 1.0) ** 0.5
     assert float(soft.confidence[0, 12, 12] / soft.confidence[0, 12, 14]) == pytest.approx(
         np.exp(2**2 / (2 * wider**2)), rel=1e-3

@@ -1,4 +1,4 @@
-"""Rows for a training of one's own: which process reads which, and tensors as torch wants them."""
+"""Rows as batches of torch tensors, and their division among processes."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -13,7 +13,7 @@ from dmrl.learn.data.torch_dataset import ProcessSampler, TorchRows, get_torchru
 
 
 class Rows:
-    """Images and numbers that tell which row they are."""
+    """A table whose images and numbers encode the row."""
 
     def __init__(self, count: int) -> None:
         self.count = count
@@ -22,6 +22,7 @@ class Rows:
         return self.count
 
     def gathered(self, rows: Sequence[int], /) -> dict[str, NDArray[Any]]:
+        """Return images (n, 4, 6, 3) and numbers (n,) of rows."""
         number = np.array(rows)
         image = np.zeros((len(rows), 4, 6, 3), np.uint8)
         image[:, 1, 2, :] = number[:, None] + np.array([0, 50, 100])
@@ -60,7 +61,7 @@ def test_shuffled_parts_are_equal_and_disjoint() -> None:
     assert list(ProcessSampler(10, (0, 3), shuffle=True, seed=2)) != first[0]
 
 
-def test_images_are_channels_first_and_one_row_is_of_a_batch() -> None:
+def test_images_are_channels_first_in_batches_and_in_single_rows() -> None:
     rows = TorchRows(Rows(7))
     assert len(rows) == 7
     batch = rows.get_batch([5, 3])
@@ -81,7 +82,7 @@ def test_a_loader_gives_batches_of_its_part(shuffle: bool) -> None:
     assert [len(batch) for batch in whole] == [4, 4, 2]
     assert ([row for batch in whole for row in batch] == list(range(10))) != shuffle
     assert [len(batch) for batch in read(part=(1, 2))] == [4, 1]
-    assert read(part=None) == whole  # without torchrun
+    assert read(part=None) == whole  # Without torchrun there is one part.
 
 
 def test_rank_and_world_size_are_read_from_torchrun(monkeypatch: pytest.MonkeyPatch) -> None:

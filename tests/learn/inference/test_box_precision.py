@@ -1,4 +1,4 @@
-"""Boxes of labels and detections, judged by COCO's rules."""
+"""Boxes of labels and detections, scored by COCO's rules."""
 
 import sys
 from pathlib import Path
@@ -28,8 +28,8 @@ Point = tuple[float, float, float]
 Images = list[tuple[list[Point], list[Point]]]
 
 
-def record(path: Path, images: Images, calibrated: bool = True) -> Path:
-    """Write images with the (u, v, depth) of their labels and detections."""
+def write_recording(path: Path, images: Images, calibrated: bool = True) -> Path:
+    """Write a recording of images with (u, v, depth) of their labels and detections."""
     with RecordingWriter(path, Provenance("test")) as sink:
         if calibrated:
             sink.write(0, topics.CALIBRATION("cf1"), CAMERA)
@@ -46,14 +46,14 @@ def record(path: Path, images: Images, calibrated: bool = True) -> Path:
     return path
 
 
-def judged(path: Path, images: Images, calibrated: bool = True) -> BoxPrecision:
-    """Judge images with the (u, v, depth) of their labels and detections."""
-    return judge_boxes(join_by_image([record(path, images, calibrated)], "truth"), WIDTH_M)
+def judge(path: Path, images: Images, calibrated: bool = True) -> BoxPrecision:
+    """Record and score images with (u, v, depth) of their labels and detections."""
+    return judge_boxes(join_by_image([write_recording(path, images, calibrated)], "truth"), WIDTH_M)
 
 
 def test_equal_boxes_have_full_precision(tmp_path: Path) -> None:
     point = (30.0, 20.0, 1.0)
-    got = judged(tmp_path / "a.mcap", [([point], [point]), ([], [])])
+    got = judge(tmp_path / "a.mcap", [([point], [point]), ([], [])])
     assert got.figures == {
         **dict.fromkeys(("ap", "ap50", "ap75", "ap_small", "ar"), pytest.approx(1)),
         **dict.fromkeys(("ap_medium", "ap_large")),
@@ -62,26 +62,26 @@ def test_equal_boxes_have_full_precision(tmp_path: Path) -> None:
 
 
 def test_a_wrong_depth_shrinks_the_box(tmp_path: Path) -> None:
-    # Intersection over union is (1 / 1.2)^2 = 0.69: enough for 0.5, 0.55, 0.6 and 0.65.
-    got = judged(tmp_path / "a.mcap", [([(30.0, 20.0, 1.0)], [(30.0, 20.0, 1.2)])])
+    # Intersection over union is (1 / 1.2)^2 = 0.69, which passes 0.5, 0.55, 0.6 and 0.65.
+    got = judge(tmp_path / "a.mcap", [([(30.0, 20.0, 1.0)], [(30.0, 20.0, 1.2)])])
     assert (got.figures["ap"], got.figures["ar"]) == (pytest.approx(0.4), pytest.approx(0.4))
     assert (got.figures["ap50"], got.figures["ap75"]) == (pytest.approx(1), 0)
 
 
 def test_boxes_end_at_the_border_of_the_image(tmp_path: Path) -> None:
-    # Both have a width of 10 px; 5 and 2.5 of them are in the image.
-    got = judged(tmp_path / "a.mcap", [([(0.0, 20.0, 1.0)], [(-2.5, 20.0, 1.0)])])
+    # Both boxes are 10 px wide; 5 and 2.5 px of them are in the image.
+    got = judge(tmp_path / "a.mcap", [([(0.0, 20.0, 1.0)], [(-2.5, 20.0, 1.0)])])
     assert (got.figures["ap50"], got.figures["ap75"]) == (pytest.approx(1), 0)
 
 
 def test_a_false_detection_in_an_empty_image_counts(tmp_path: Path) -> None:
     point = (30.0, 20.0, 1.0)
     images = [([point], [(5.0, 5.0, 1.0), point]), ([], [point])]
-    assert judged(tmp_path / "a.mcap", images).figures["ap"] == pytest.approx(1 / 3, abs=0.01)
+    assert judge(tmp_path / "a.mcap", images).figures["ap"] == pytest.approx(1 / 3, abs=0.01)
 
 
 def test_without_detections_the_precision_is_zero(tmp_path: Path) -> None:
-    got = judged(tmp_path / "a.mcap", [([(30.0, 20.0, 1.0)], [])])
+    got = judge(tmp_path / "a.mcap", [([(30.0, 20.0, 1.0)], [])])
     assert (got.figures["ap"], got.figures["ar"]) == (0, 0)
 
 
@@ -89,7 +89,7 @@ def test_an_image_with_a_label_without_depth_is_left_out(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     point, flat = (30.0, 20.0, 1.0), (10.0, 10.0, float("nan"))
-    got = judged(tmp_path / "a.mcap", [([point], [point]), ([point, flat], [])])
+    got = judge(tmp_path / "a.mcap", [([point], [point]), ([point, flat], [])])
     assert (got.images, got.left_out, got.figures["ap"]) == (1, 1, pytest.approx(1))
     got.print("seen.mcap")
     said = capsys.readouterr().out
@@ -100,7 +100,7 @@ def test_an_image_with_a_label_without_depth_is_left_out(
 def test_a_recording_without_calibration_is_refused(tmp_path: Path) -> None:
     point = (30.0, 20.0, 1.0)
     with pytest.raises(MissingTopic, match="/cf1/camera/calibration"):
-        judged(tmp_path / "a.mcap", [([point], [point])], calibrated=False)
+        judge(tmp_path / "a.mcap", [([point], [point])], calibrated=False)
 
 
 def test_a_missing_package_is_named_with_its_extra(
@@ -110,16 +110,16 @@ def test_a_missing_package_is_named_with_its_extra(
     monkeypatch.setitem(sys.modules, "pycocotools.coco", none)
     point = (30.0, 20.0, 1.0)
     with pytest.raises(MissingExtra, match=r"pip install 'dmrl\[coco\]'"):
-        judged(tmp_path / "a.mcap", [([point], [point])])
+        judge(tmp_path / "a.mcap", [([point], [point])])
 
 
 @pytest.mark.heavy
-def test_boxes_of_two_models_are_judged_each(
+def test_boxes_of_two_models_are_scored_separately(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     label = (30.0, 20.0, 1.0)
     paths = [
-        record(tmp_path / f"{depth_m}.mcap", [([label], [(30.0, 20.0, depth_m)])])
+        write_recording(tmp_path / f"{depth_m}.mcap", [([label], [(30.0, 20.0, depth_m)])])
         for depth_m in (1.0, 1.2)
     ]
     settings = Settings(draws=5, robot_width_m=WIDTH_M)

@@ -22,8 +22,8 @@ from dmrl.learn.inference.matching import Points
 from dmrl.learn.networks.architectures import build_network
 
 
-def scored(slope: float, offset: float, count: int = 4000) -> ScoredDetections:
-    """Detections whose chance to be right is that of their logit times slope plus offset."""
+def draw_scored(slope: float, offset: float, count: int = 4000) -> ScoredDetections:
+    """Draw a detection an image, right with the probability of logit slope * logit + offset."""
     rng = np.random.default_rng(3)
     logits = rng.uniform(-3.5, 2, count)
     right = rng.random(count) < 1 / (1 + np.exp(-slope * logits - offset))
@@ -34,20 +34,20 @@ def scored(slope: float, offset: float, count: int = 4000) -> ScoredDetections:
     )
 
 
-def expected_error(found: MetricCurves) -> float:
-    """Of confidence against the share that is right, over all detections."""
+def compute_calibration_error(found: MetricCurves) -> float:
+    """Return the mean gap between confidence and the share of right detections, over bins."""
     gap = np.abs(found.bin_confidence - found.bin_right)
     return float(np.nansum(gap * found.bin_count) / found.bin_count.sum())
 
 
-def test_the_slope_and_offset_are_found() -> None:
-    found = fit_calibration(scored(2.5, 1.0))
+def test_slope_and_offset_of_the_simulation_are_recovered() -> None:
+    found = fit_calibration(draw_scored(2.5, 1.0))
     assert found is not None
     assert found == pytest.approx((2.5, 1.0), abs=0.2)
 
 
-def test_confidence_is_the_share_that_is_right_afterwards() -> None:
-    before = scored(2.5, 1.0)
+def test_calibrated_confidence_equals_the_share_of_right_detections() -> None:
+    before = draw_scored(2.5, 1.0)
     found = fit_calibration(before)
     assert found is not None
     old = before.detections.confidence
@@ -55,13 +55,13 @@ def test_confidence_is_the_share_that_is_right_afterwards() -> None:
     after = score_detections(
         before.images, before.labels, replace(before.detections, confidence=new)
     )
-    gaps = [expected_error(compute_curves(one)) for one in (before, after)]
+    gaps = [compute_calibration_error(compute_curves(one)) for one in (before, after)]
     assert gaps[0] > 0.1
     assert gaps[1] < 0.03
 
 
-def test_every_source_counts_the_same_however_large_it_is() -> None:
-    large, small = scored(2.5, 1.0, count=8000), scored(2.5, -1.0, count=1000)
+def test_every_source_counts_the_same_whatever_its_size() -> None:
+    large, small = draw_scored(2.5, 1.0, count=8000), draw_scored(2.5, -1.0, count=1000)
     first = np.array([0, large.images])
     labels, found = (
         Points.concatenate([getattr(large, name), getattr(small, name)], first)
@@ -77,11 +77,11 @@ def test_every_source_counts_the_same_however_large_it_is() -> None:
 
 
 def test_calibration_needs_enough_data_and_positive_slope() -> None:
-    assert fit_calibration(scored(2.5, 1.0, count=40)) is None
-    assert fit_calibration(scored(-1.0, 0.0)) is None
+    assert fit_calibration(draw_scored(2.5, 1.0, count=40)) is None
+    assert fit_calibration(draw_scored(-1.0, 0.0)) is None
 
 
-def test_the_last_layer_carries_it_and_nothing_else_changes() -> None:
+def test_calibration_changes_only_the_confidence_of_the_last_layer() -> None:
     network = build_network("dmrl-nano", seed=1).eval()
     images = torch.rand(2, 3, 64, 96)
     with torch.inference_mode():
@@ -101,7 +101,7 @@ def test_network_with_another_last_layer_is_not_calibrated() -> None:
 
 
 def score_points(confidence: list[float], right: list[bool]) -> ScoredDetections:
-    """One detection an image, of which it is known whether it is right."""
+    """Return one detection an image with its confidence, right or 100 px off."""
     image, u = np.arange(len(right)), np.full(len(right), 50.0)
     truth = Points(image, np.where(right, u, 150.0), u, np.ones(len(u)), np.ones(len(u)))
     return score_detections(
@@ -109,13 +109,13 @@ def score_points(confidence: list[float], right: list[bool]) -> ScoredDetections
     )
 
 
-def test_thirty_of_each_are_needed_and_faint_ones_do_not_count() -> None:
+def test_thirty_right_and_wrong_detections_are_needed_above_the_minimum_confidence() -> None:
     for right, wrong, known in (
         (MIN_DETECTIONS, MIN_DETECTIONS, True),
         (MIN_DETECTIONS - 1, 99, False),
         (99, 29, False),
     ):
-        # Three in four of the sure ones are right.
+        # Three in four detections of high confidence are right, one in four of low confidence.
         sure = [True] * (right * 3 // 4) + [False] * (wrong // 4)
         weak = [True] * (right - right * 3 // 4) + [False] * (wrong - wrong // 4)
         confidence = [0.8] * len(sure) + [0.3] * len(weak)

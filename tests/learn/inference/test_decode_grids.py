@@ -29,7 +29,7 @@ def test_an_offset_moves_a_peak_and_keeps_it_in_the_image() -> None:
     assert found.v_px[0, :2].tolist() == [28.0, 8.0]
 
 
-def test_two_cells_that_name_one_robot_give_one_detection() -> None:
+def test_two_cells_that_point_to_one_robot_give_one_detection() -> None:
     confidence, offset = np.zeros((2, 4, 9)), np.zeros((2, 2, 4, 9))
     confidence[0, 1, [1, 3, 7]] = 0.9, 0.8, 0.7
     offset[0, 0, 1, 3] = -1.9
@@ -42,7 +42,7 @@ def test_two_cells_that_name_one_robot_give_one_detection() -> None:
     assert found.u_px[1, 0] == 36.0
 
 
-def test_the_best_cell_is_kept_however_low() -> None:
+def test_the_best_cell_is_kept_at_any_confidence() -> None:
     confidence = np.full((2, 3, 3), 1e-6)
     confidence[0, 2, 2] = 2e-6
     found = decode(confidence, np.ones((2, 3, 3)), min_confidence=0.5)
@@ -92,7 +92,7 @@ def test_detections_within_one_cell_are_merged(away_px: float, count: int) -> No
 
 
 @pytest.mark.parametrize(("least", "count"), [(0.3, 2), (0.31, 1), (0.0, 3), (-1.0, 3)])
-def test_peaks_below_the_least_confidence_are_dropped(least: float, count: int) -> None:
+def test_peaks_below_the_minimum_confidence_are_dropped(least: float, count: int) -> None:
     confidence = np.full((1, 1, 9), 0.01)
     confidence[0, 0, [0, 4]] = 0.5, 0.3
     confidence[0, 0, 6:] = 0.0, 0.2, 0.0
@@ -102,10 +102,13 @@ def test_peaks_below_the_least_confidence_are_dropped(least: float, count: int) 
     assert found.count[0] == count
 
 
-def plain(
+def decode_in_loop(
     confidence: np.ndarray, offset: np.ndarray | None, most: int, least: float
 ) -> list[tuple[int, int, float, float]]:
-    """Row, column, u and v of the detections of one grid, the surest first, by the rules."""
+    """Decode one grid in a loop; return (row, column, u, v) of detections, best first.
+
+    Confidence (rows, columns) and offset (2, rows, columns) are in cells; u and v are in pixels.
+    """
     rows, cols = confidence.shape
     found = []
     for r in range(rows):
@@ -155,7 +158,7 @@ def test_decoded_detections_equal_a_loop_over_cells(
     moved = offset if shifted else None
     found = decode(confidence, depth_m, moved, spread, class_id, most=most, min_confidence=least)
     for k in range(2):
-        wanted = plain(confidence[k], offset[k] if shifted else None, most, least)
+        wanted = decode_in_loop(confidence[k], offset[k] if shifted else None, most, least)
         assert found.count[k] == len(wanted)
         for n, (r, c, u, v) in enumerate(wanted):
             assert (found.u_px[k, n], found.v_px[k, n]) == pytest.approx((u, v))

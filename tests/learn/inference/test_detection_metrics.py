@@ -21,41 +21,43 @@ from dmrl.learn.inference.matching import Points
 from dmrl.learn.inference.metric_definitions import METRIC_DEFINITIONS
 
 
-def scene(images: int, offset_px: float = 0.0, depth_m: float = 1.0) -> tuple[Points, Points]:
-    """One label per image, found with an offset in u and 0.1 m too near."""
+def build_scene(images: int, offset_px: float = 0.0, depth_m: float = 1.0) -> tuple[Points, Points]:
+    """Return one label an image and its detection, offset to the left and 0.1 m too near."""
     image = np.arange(images)
     u, v, d = np.full(images, 100.0), np.full(images, 50.0), np.full(images, depth_m)
     ones = np.ones(images)
     return Points(image, u, v, d, ones), Points(image, u - offset_px, v, d - 0.1, 0.9 * ones)
 
 
-def overall(labels: Points, found: Points, images: int, draws: int = 20) -> BandMetrics:
+def compute_overall(labels: Points, found: Points, images: int, draws: int = 20) -> BandMetrics:
+    """Return the metrics over all depths at threshold 0.33."""
     return compute_band_metrics(
         score_detections(images, labels, found), threshold=0.33, draws=draws
     )[0]
 
 
-def values(band: BandMetrics) -> dict[str, float]:
+def get_values(band: BandMetrics) -> dict[str, float]:
+    """Return the value of each metric by name, without its interval."""
     return {name: figure.value for name, figure in band.figures.items()}
 
 
-def test_a_perfect_detector_has_perfect_figures() -> None:
-    labels, found = scene(10)
-    got = values(overall(labels, found, 10))
+def test_a_perfect_detector_has_perfect_metrics() -> None:
+    labels, found = build_scene(10)
+    got = get_values(compute_overall(labels, found, 10))
     assert got["median_px"] == got["p95_px"] == got["rmse_px"] == got["bias_u_px"] == 0
     assert got["within_8_px"] == got["f1"] == got["ap_8_px"] == got["ap_16_px"] == 1
     assert got["depth_mae_m"] == pytest.approx(0.1)
 
 
-def test_curves_of_four_detections_by_hand() -> None:
-    labels, _ = scene(3)
+def test_curves_of_four_detections_equal_hand_computed_ones() -> None:
+    labels, _ = build_scene(3)
     at = np.full(4, 100.0)
-    at[2] = 200.0  # the third is beside every label
+    at[2] = 200.0  # The third is far from every label.
     confidence = np.array([0.95, 0.85, 0.85, 0.15])
     depth = np.ones(4)
     found = Points(np.array([0, 1, 1, 2]), at, np.full(4, 50.0), depth, confidence)
     got = compute_curves(score_detections(3, labels, found))
-    # Equal confidences are one point of the curve.
+    # Detections of equal confidence are one point of the curve.
     assert got.confidence.tolist() == [0.95, 0.85, 0.15]
     assert got.precision == pytest.approx([1, 2 / 3, 3 / 4])
     assert got.recall == pytest.approx([1 / 3, 2 / 3, 1])
@@ -66,27 +68,27 @@ def test_curves_of_four_detections_by_hand() -> None:
 
 
 def test_curves_without_detections_or_labels_are_empty() -> None:
-    labels, found = scene(3)
+    labels, found = build_scene(3)
     none = found.select(found.image > 9)
     assert compute_curves(score_detections(3, labels, none)).recall.size == 0
     assert np.isnan(compute_curves(score_detections(3, none, found)).recall).all()
-    many = compute_curves(score_detections(3, *scene(3)), most=1)
+    many = compute_curves(score_detections(3, *build_scene(3)), most=1)
     assert many.recall.tolist() == [1.0]
 
 
-def test_figures_of_a_known_offset() -> None:
-    labels, found = scene(10, offset_px=12)
-    got = values(overall(labels, found, 10))
+def test_metrics_of_a_known_offset_equal_it() -> None:
+    labels, found = build_scene(10, offset_px=12)
+    got = get_values(compute_overall(labels, found, 10))
     assert got["median_px"] == got["mean_px"] == got["rmse_px"] == -got["bias_u_px"] == 12
     assert (got["within_8_px"], got["within_20_px"]) == (0, 1)
     assert (got["ap_8_px"], got["ap_16_px"], got["recall"]) == (0, 1, 1)
 
 
-def test_half_the_labels_missed() -> None:
-    labels, found = scene(10)
+def test_missed_labels_lower_recall_and_not_precision() -> None:
+    labels, found = build_scene(10)
     half = found.select(found.image < 5)
-    band = overall(labels, half, 10)
-    got = values(band)
+    band = compute_overall(labels, half, 10)
+    got = get_values(band)
     assert band.unmatched == 5
     assert got["within_20_px"] == got["recall"] == got["ap_16_px"] == 0.5
     assert got["precision"] == 1
@@ -96,21 +98,21 @@ def test_half_the_labels_missed() -> None:
 
 
 def test_detections_in_images_without_labels_are_wrong() -> None:
-    labels, found = scene(10)
-    got = values(overall(labels.select(labels.image < 5), found, 10))
+    labels, found = build_scene(10)
+    got = get_values(compute_overall(labels.select(labels.image < 5), found, 10))
     assert (got["precision"], got["recall"], got["within_8_px"]) == (0.5, 1, 1)
 
 
-def test_below_the_threshold_is_not_claimed() -> None:
-    labels, found = scene(4)
+def test_detections_below_the_threshold_do_not_count_in_precision_and_recall() -> None:
+    labels, found = build_scene(4)
     sure = Points(found.image, found.u_px, found.v_px, found.depth_m, np.array([0.9, 0.33, 0.3, 0]))
-    got = values(overall(labels, sure, 4))
+    got = get_values(compute_overall(labels, sure, 4))
     assert (got["precision"], got["recall"]) == (1, 0.5)
     assert got["ap_16_px"] == 1
 
 
 def test_bands_hold_their_own_labels_and_empty_bands_are_nan() -> None:
-    labels, found = scene(10, depth_m=0.7)
+    labels, found = build_scene(10, depth_m=0.7)
     bands = compute_band_metrics(score_detections(10, labels, found), threshold=0.33, draws=5)
     assert [(b.from_m, b.to_m) for b in bands] == list(DEPTH_BANDS_M)
     assert [b.labels for b in bands] == [10, 0, 10, 0, 0, 0]
@@ -119,7 +121,7 @@ def test_bands_hold_their_own_labels_and_empty_bands_are_nan() -> None:
 
 
 def test_a_wrong_detection_counts_in_the_band_of_its_own_depth() -> None:
-    labels, found = scene(10, depth_m=0.7)
+    labels, found = build_scene(10, depth_m=0.7)
     extra = Points(np.arange(10), np.zeros(10), np.zeros(10), np.full(10, 1.7), np.full(10, 0.8))
     order = np.argsort(np.concatenate([found.image, extra.image]), kind="stable")
     both = Points.concatenate([found, extra], np.zeros(2, np.int64)).select(order)
@@ -128,21 +130,21 @@ def test_a_wrong_detection_counts_in_the_band_of_its_own_depth() -> None:
     assert bands[4].figures["precision"].value == 0
 
 
-def test_average_precision_of_a_ranked_list_by_hand() -> None:
+def test_average_precision_of_a_ranked_list_equals_a_hand_computed_one() -> None:
     right = np.array([True, False, True, False])
     area = average_precision(
         np.array([0.9, 0.8, 0.7, 0.6]), right, ~right, np.ones((1, 4)), np.array([4.0])
     )
-    # Recall 1/4 at precision 1, then 2/4 at 2/3; two of four labels are never found.
+    # Recall is 1/4 at precision 1, then 2/4 at 2/3; two of four labels are never found.
     assert area[0] == pytest.approx(1 / 4 + 1 / 4 * 2 / 3)
 
 
-def test_equal_confidences_count_together_whatever_their_order() -> None:
+def test_equal_confidences_count_together_in_any_order() -> None:
     confidence = np.array([0.9, 0.5, 0.5, 0.5])
     for right in ([True, True, False, False], [True, False, False, True]):
         is_right = np.array(right)
         area = average_precision(confidence, is_right, ~is_right, np.ones((1, 4)), np.array([2.0]))
-        # The second label is found by a threshold that lets four detections through.
+        # The threshold that finds the second label admits all four detections.
         assert area[0] == pytest.approx(1 / 2 + 1 / 2 * 2 / 4)
 
 
@@ -151,12 +153,12 @@ def test_intervals_cover_the_value_and_shrink_with_more_images() -> None:
     rng = np.random.default_rng(0)
     widths = []
     for images in (30, 3000):
-        labels, found = scene(images)
+        labels, found = build_scene(images)
         near = rng.random(images) < 0.7
         off = Points(
             found.image, np.where(near, found.u_px, 0), found.v_px, found.depth_m, found.confidence
         )
-        share = overall(labels, off, images, draws=300).figures["within_8_px"]
+        share = compute_overall(labels, off, images, draws=300).figures["within_8_px"]
         assert share.low < share.value < share.high
         widths.append(share.high - share.low)
     assert widths[1] == pytest.approx(2 * 1.96 * math.sqrt(0.7 * 0.3 / 3000), rel=0.2)
@@ -165,19 +167,22 @@ def test_intervals_cover_the_value_and_shrink_with_more_images() -> None:
 
 def test_the_seed_decides_the_intervals() -> None:
     rng = np.random.default_rng(1)
-    labels, found = scene(40)
+    labels, found = build_scene(40)
     off = Points(found.image, rng.random(40) * 200, found.v_px, found.depth_m, found.confidence)
     scored = score_detections(40, labels, off)
 
     def figures(seed: int) -> list[BandMetrics]:
         return compute_band_metrics(scored, threshold=0.33, draws=50, seed=seed)[:1]
 
-    assert repr(figures(1)) == repr(figures(1)) != repr(figures(2))  # NaN is no NaN's equal
+    # Representations are compared because NaN does not equal NaN.
+    assert repr(figures(1)) == repr(figures(1)) != repr(figures(2))
 
 
 @given(st.lists(st.floats(-100, 100), min_size=1, max_size=30), st.randoms())
 @pytest.mark.heavy
-def test_the_median_is_numpys_also_with_repeats(numbers: list[float], random: object) -> None:
+def test_weighted_median_equals_that_of_repeated_numbers(
+    numbers: list[float], random: object
+) -> None:
     array = np.array(numbers)
     times = np.array([random.randint(1, 3) for _ in numbers])  # type: ignore[attr-defined]
     repeated = np.repeat(array, times)
@@ -189,7 +194,7 @@ def test_the_median_is_numpys_also_with_repeats(numbers: list[float], random: ob
 def test_ten_thousand_images_take_seconds() -> None:
     rng = np.random.default_rng(0)
     images = 10_000
-    labels, found = scene(images)
+    labels, found = build_scene(images)
     off = Points(
         found.image,
         rng.random(images) * 200,
@@ -205,7 +210,7 @@ def test_ten_thousand_images_take_seconds() -> None:
 @pytest.mark.heavy
 def test_an_interval_holds_the_middle_95_percent() -> None:
     images = 400
-    labels, found = scene(images)
+    labels, found = build_scene(images)
     half = Points(
         found.image,
         found.u_px - 30 * (found.image % 2),
@@ -217,13 +222,16 @@ def test_an_interval_holds_the_middle_95_percent() -> None:
         0
     ]
     share = band.figures["within_8_px"]
-    reach = 1.96 * math.sqrt(0.25 / images)  # of a share of one half
+    reach = 1.96 * math.sqrt(0.25 / images)  # the interval of a share of one half
     assert share.value == 0.5
     assert (share.low, share.high) == pytest.approx((0.5 - reach, 0.5 + reach), abs=0.006)
 
 
-def off_by(*errors: tuple[float, float, float]) -> dict[str, float]:
-    """Figures of one label an image that was found so far right, down and behind."""
+def compute_metrics_of_errors(*errors: tuple[float, float, float]) -> dict[str, float]:
+    """Return metrics of one label an image, by errors of its detection.
+
+    Errors are in pixels to the right and down, and in metres behind the label.
+    """
     off = np.array(errors)
     image, u = np.arange(len(off)), np.full(len(off), 100.0)
     truth = Points(image, u, u / 2, u / 50, np.ones(len(off)))
@@ -234,12 +242,15 @@ def off_by(*errors: tuple[float, float, float]) -> dict[str, float]:
 
 
 def test_metrics_of_different_errors_equal_hand_computed_values() -> None:
-    got = off_by((3.0, 4.0, 0.1), (0.0, 12.0, -0.2), (-8.0, 0.0, 0.4), (30.0, 40.0, 0.0))
+    got = compute_metrics_of_errors(
+        (3.0, 4.0, 0.1), (0.0, 12.0, -0.2), (-8.0, 0.0, 0.4), (30.0, 40.0, 0.0)
+    )
     assert got["mean_px"] == pytest.approx((5 + 12 + 8 + 50) / 4)
     assert got["rmse_px"] == pytest.approx(((25 + 144 + 64 + 2500) / 4) ** 0.5)
     assert got["median_px"] == pytest.approx(10)
     assert got["p95_px"] == pytest.approx(50)
-    assert got["bias_u_px"] == pytest.approx(1.5)  # detection minus label: 3, 0, -8, 30
+    # The bias is the median of detection minus label: of 3, 0, -8 and 30 px.
+    assert got["bias_u_px"] == pytest.approx(1.5)
     assert got["bias_v_px"] == pytest.approx(8)
     assert got["depth_mae_m"] == pytest.approx(0.7 / 4)
     assert got["depth_rmse_m"] == pytest.approx((0.21 / 4) ** 0.5)
@@ -248,26 +259,30 @@ def test_metrics_of_different_errors_equal_hand_computed_values() -> None:
 
 
 @pytest.mark.parametrize(("off_px", "name"), [(8.0, "within_8_px"), (20.0, "within_20_px")])
-def test_an_error_of_the_radius_is_within_it(off_px: float, name: str) -> None:
-    assert [off_by((off, 0, 0))[name] for off in (off_px, off_px + 0.1)] == [1, 0]
+def test_an_error_equal_to_the_radius_is_within_it(off_px: float, name: str) -> None:
+    assert [compute_metrics_of_errors((off, 0, 0))[name] for off in (off_px, off_px + 0.1)] == [
+        1,
+        0,
+    ]
 
 
-def test_a_band_holds_its_lower_end() -> None:
+def test_a_band_includes_its_lower_end() -> None:
     for depth_m, held in ((0.5, 2), (0.499, 1), (1.0, 3), (1.5, 4), (2.0, 5)):
         bands = compute_band_metrics(
-            score_detections(1, *scene(1, depth_m=depth_m)), threshold=0.33, draws=2
+            score_detections(1, *build_scene(1, depth_m=depth_m)), threshold=0.33, draws=2
         )
         assert [band.labels for band in bands] == [1, *(int(k == held) for k in range(1, 6))]
         assert bands[held].images == 1
 
 
 def test_bootstrap_samples_have_the_number_of_images() -> None:
-    labels, found = scene(7)
+    labels, found = build_scene(7)
     rows = np.concatenate(list(iter_bootstrap_weights(score_detections(7, labels, found), 500, 3)))
     assert rows.shape == (500, 7)
     assert (rows.sum(axis=1) == 7).all()
     assert rows.mean(axis=0) == pytest.approx(np.ones(7), abs=0.15)
-    assert rows.var() == pytest.approx(6 / 7, rel=0.1)  # binomial: 7 draws of 1 / 7
+    # The count of an image is binomial: 7 draws with probability 1 / 7.
+    assert rows.var() == pytest.approx(6 / 7, rel=0.1)
 
 
 @given(st.lists(st.tuples(st.integers(0, 9), st.integers(0, 3)), min_size=1, max_size=12))
@@ -284,7 +299,7 @@ def test_weighted_quantile_equals_quantile_of_repeated_values(pairs: list[tuple[
 
 
 def test_curves_are_thinned_evenly_and_confidence_1_is_in_the_last_bin() -> None:
-    labels, _ = scene(100)
+    labels, _ = build_scene(100)
     confidence = np.linspace(1.0, 0.01, 100)
     found = Points(labels.image, labels.u_px, labels.v_px, labels.depth_m, confidence)
     got = compute_curves(score_detections(100, labels, found), most=5)

@@ -1,4 +1,4 @@
-"""Figures of any detections: held against a plain way to work them out."""
+"""Metrics of random detections, compared with plain computations."""
 
 import numpy as np
 import pytest
@@ -13,8 +13,11 @@ from dmrl.learn.inference.detection_metrics import (
 from dmrl.learn.inference.matching import Points
 
 
-def anything(seed: int, images: int) -> tuple[Points, Points]:
-    """Labels and detections, some near each other; every number is another."""
+def draw_points(seed: int, images: int) -> tuple[Points, Points]:
+    """Draw 2 labels and 3 detections an image on average, with distinct confidences.
+
+    Some detections lie near labels.
+    """
     rng = np.random.default_rng(seed)
 
     def some(most: int) -> Points:
@@ -31,7 +34,7 @@ def anything(seed: int, images: int) -> tuple[Points, Points]:
 @pytest.mark.parametrize("seed", range(3))
 def test_image_weights_equal_repetition_counts(seed: int) -> None:
     images, rng = 9, np.random.default_rng(seed)
-    labels, found = anything(seed, images)
+    labels, found = draw_points(seed, images)
     scored = score_detections(images, labels, found)
     weights = rng.integers(0, 4, images)
     weights[0] = 2
@@ -62,7 +65,7 @@ def test_average_precision_equals_a_sum_over_thresholds(
     confidence = np.array([c / 7 for c, _ in rows])
     right, wrong = (np.array([kind == k for _, kind in rows]) for k in "rw")
     total = right.sum() + more
-    curve = []  # recall and precision at each confidence, the surest first
+    curve = []  # recall and precision at each confidence, highest first
     for least in sorted(set(confidence), reverse=True):
         taken = confidence >= least
         if (taken & (right | wrong)).any():
@@ -78,8 +81,8 @@ def test_average_precision_equals_a_sum_over_thresholds(
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_precision_and_recall_are_plain_shares(seed: int) -> None:
-    labels, found = anything(seed, 12)
+def test_metrics_equal_plain_shares_and_means(seed: int) -> None:
+    labels, found = draw_points(seed, 12)
     scored = score_detections(12, labels, found)
     band, threshold = (0.5, 1.5), 0.35
     got = compute_metrics(scored, band, threshold, np.ones((1, 12)))

@@ -13,10 +13,11 @@ from dmrl.learn.inference.matching import Points
 from dmrl.learn.pretrained import resolve_model_path
 
 
-def scored(images: int = 4000) -> ScoredDetections:
-    """One peer an image, found in 80 % at 0.75 m and 40 % at 1.75 m, and one alarm in two images.
+def simulate_scored(images: int = 4000) -> ScoredDetections:
+    """Simulate one peer an image, at 0.75 or 1.75 m, and one false detection in two images.
 
-    Logits are normal with unit variance around 1 and -1: their log likelihood ratio is 2 logit.
+    Peers are found in 80 % of images at 0.75 m and 40 % at 1.75 m. Logits of true and false
+    detections are normal around 1 and -1 with unit variance, so their log ratio is 2 logit.
     """
     rng = np.random.default_rng(0)
     depth_m = np.where(np.arange(images) % 2, 1.75, 0.75)
@@ -37,11 +38,11 @@ def scored(images: int = 4000) -> ScoredDetections:
 
 
 def test_detector_rates_are_recovered_from_samples() -> None:
-    rates = measure_rates(scored())
+    rates = measure_rates(simulate_scored())
     assert rates is not None
     assert set(rates) == set(RATE_FIELDS)
     assert rates["distance_m"] == [0.75, 1.75]
-    # Logits below that of 0.05, -2.9, do not count: 3 % of the alarms.
+    # Confidences below 0.05, a logit of -2.9, do not count: 3 % of the false detections.
     assert rates["detected"] == pytest.approx([0.8, 0.4], abs=0.03)
     assert rates["false_per_image"] == pytest.approx(0.485, abs=0.03)
     ratio = DetectorRates(**rates).log_ratio(1 / (1 + np.exp(-np.array([-1.0, 0.0, 1.0]))))
@@ -49,7 +50,7 @@ def test_detector_rates_are_recovered_from_samples() -> None:
 
 
 def test_few_detections_give_no_rates() -> None:
-    assert measure_rates(scored(40)) is None
+    assert measure_rates(simulate_scored(40)) is None
 
 
 def test_rates_are_read_from_the_shipped_model_and_are_optional(
@@ -66,7 +67,7 @@ def test_rates_are_read_from_the_shipped_model_and_are_optional(
 
 
 @pytest.mark.parametrize("change", [{"slope": "x"}, {"detected": [0.1]}, {"offset": None}])
-def test_damaged_rates_are_one_error(tmp_path: Path, change: dict[str, object]) -> None:
+def test_damaged_rates_are_refused(tmp_path: Path, change: dict[str, object]) -> None:
     rates = read_rates(resolve_model_path(Path("dmrl-nano")))
     assert rates is not None
     (tmp_path / "model.json").write_text(json.dumps({"rates": {**rates, **change}}))

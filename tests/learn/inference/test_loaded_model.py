@@ -23,7 +23,7 @@ from dmrl.learn.networks.architectures import build_network
 
 @pytest.fixture
 def run(tmp_path: Path) -> Path:
-    """A run folder with an untrained network."""
+    """Return a run folder with an untrained network."""
     folder = tmp_path / "run"
     folder.mkdir()
     network = build_network("locanet", seed=3).eval()
@@ -32,7 +32,7 @@ def run(tmp_path: Path) -> Path:
 
 
 class Bomb:
-    """A pickle that leaves a file behind when it is opened."""
+    """An object whose pickle creates a file when it is opened."""
 
     def __init__(self, mark: Path) -> None:
         self.mark = mark
@@ -41,7 +41,7 @@ class Bomb:
         return Path.touch, (self.mark,)  # type: ignore[return-value]
 
 
-def test_a_saved_model_sees_the_same_when_it_is_loaded(run: Path) -> None:
+def test_a_loaded_model_gives_the_grids_of_the_saved_one(run: Path) -> None:
     images = np.random.default_rng(0).integers(0, 256, (2, 64, 64, 3), np.uint8)
     wanted = Model(build_network("locanet", seed=3).eval(), "locanet").grids(images)
     for path in (run, run / "model.safetensors"):
@@ -82,7 +82,7 @@ def test_model_with_extra_channels_round_trips(tmp_path: Path) -> None:
     assert (grids.class_id == 1).all()
 
 
-def test_a_description_with_strange_outputs_is_refused(run: Path) -> None:
+def test_a_description_with_unknown_outputs_is_refused(run: Path) -> None:
     said = json.loads((run / "model.json").read_text())
     for outputs in (["log_depth"], [*said["outputs"], "class_1"], 3):
         (run / "model.json").write_text(json.dumps(said | {"outputs": outputs}))
@@ -90,7 +90,7 @@ def test_a_description_with_strange_outputs_is_refused(run: Path) -> None:
             load_model(run)
 
 
-def test_a_known_network_lends_its_weights_to_one_with_more_channels() -> None:
+def test_weights_are_transferred_to_a_network_with_more_channels() -> None:
     known, fresh = (
         build_network("dmrl-nano", seed=1),
         build_network("dmrl-nano", seed=2, extra=("log_spread",)),
@@ -134,7 +134,7 @@ def test_a_torch_file_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("content", [b"", b"hello", b"\x89PNG\r\n\x1a\n" + bytes(20)])
-def test_anything_else_is_not_a_model(tmp_path: Path, content: bytes) -> None:
+def test_a_file_of_another_format_is_not_a_model(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "weights"
     path.write_bytes(content)
     with pytest.raises(ModelError, match=r"is not a model\. Give a run folder"):
@@ -190,7 +190,9 @@ def test_damaged_weights_give_one_line_errors(run: Path) -> None:
         ),
     ],
 )
-def test_a_wrong_description_is_named(run: Path, key: str, value: str, text: str) -> None:
+def test_a_wrong_description_is_refused_by_its_key(
+    run: Path, key: str, value: str, text: str
+) -> None:
     said = json.loads((run / "model.json").read_text())
     (run / "model.json").write_text(json.dumps({**said, key: value}))
     with pytest.raises(ModelError, match=text):
@@ -219,7 +221,7 @@ def test_weights_are_interpolated_by_a_fraction(share: float) -> None:
     network, first = build_network("locanet", seed=1), get_weights(build_network("locanet", seed=2))
     before = {name: value.clone() for name, value in get_weights(network).items()}
     assert not any(name.endswith("num_batches_tracked") for name in before)
-    del first["head.bias"]  # what others lack stays
+    del first["head.bias"]  # A tensor that the others lack stays as it is.
     interpolate_weights(network, first, share)
     for name, value in get_weights(network).items():
         other = first.get(name, before[name])
@@ -240,7 +242,7 @@ def test_weights_are_interpolated_by_a_fraction(share: float) -> None:
         ({"training": []}, False),
     ],
 )
-def test_a_description_is_of_images_and_numbers_that_can_be(
+def test_a_description_with_impossible_sizes_or_numbers_is_refused(
     run: Path, change: dict[str, object], fits: bool
 ) -> None:
     said = json.loads((run / "model.json").read_text())
@@ -255,7 +257,7 @@ def test_a_description_is_of_images_and_numbers_that_can_be(
             load_model(run)
 
 
-def test_a_model_is_described_by_what_it_is() -> None:
+def test_the_description_of_a_model_has_its_properties() -> None:
     network = build_network("dmrl-nano", extra=("log_spread",))
     model = Model(network, "dmrl-nano", "n", 64, 48, 0.25, "truth", {"epochs": 3})
     assert describe(model) == {
@@ -275,7 +277,7 @@ def test_a_model_is_described_by_what_it_is() -> None:
 
 
 @pytest.mark.parametrize(("size", "fits"), [((64, 48), True), ((60, 48), False), ((64, 44), False)])
-def test_both_sides_of_an_image_are_whole_cells(size: tuple[int, int], fits: bool) -> None:
+def test_width_and_height_must_be_whole_cells(size: tuple[int, int], fits: bool) -> None:
     model = Model(build_network("locanet"), "locanet")
     if fits:
         model.require_size(*size, "here")

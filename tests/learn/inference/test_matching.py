@@ -14,8 +14,8 @@ from dmrl.learn.inference.matching import (
 )
 
 
-def points(*rows: tuple[int, float, float, float, float]) -> Points:
-    """Rows of image, u, v, depth, confidence."""
+def build_points(*rows: tuple[int, float, float, float, float]) -> Points:
+    """Return points from rows of image, u, v, depth and confidence."""
     columns = np.array(rows, float).reshape(-1, 5).T
     return Points(columns[0].astype(np.int64), *columns[1:])
 
@@ -29,10 +29,10 @@ PIXELS = st.integers(0, 9).map(float)
 def test_labels_and_detections_pair_at_the_least_total_distance(
     label_px: np.ndarray, found_px: np.ndarray
 ) -> None:
-    labels = points(*[(0, u, v, 1, 1) for u, v in label_px])
-    found = points(*[(0, u, v, 1, 1) for u, v in found_px])
+    labels = build_points(*[(0, u, v, 1, 1) for u, v in label_px])
+    found = build_points(*[(0, u, v, 1, 1) for u, v in found_px])
     got = assign_detections(labels, found)
-    # Only as many detections as there are labels take part, the most confident ones.
+    # Only the most confident detections take part, as many as there are labels.
     cost = np.hypot(*(label_px[:, None] - found_px[None, : len(label_px)]).transpose(2, 0, 1))
     paired = np.flatnonzero(got >= 0)
     assert len(set(got[paired])) == len(paired) == min(cost.shape)
@@ -45,43 +45,44 @@ def test_labels_and_detections_pair_at_the_least_total_distance(
 
 
 def test_one_label_takes_the_most_confident_detection_not_the_nearest() -> None:
-    labels = points((0, 10, 10, 1, 1))
-    found = points((0, 100, 10, 2, 0.9), (0, 11, 10, 1, 0.8))
+    labels = build_points((0, 10, 10, 1, 1))
+    found = build_points((0, 100, 10, 2, 0.9), (0, 11, 10, 1, 0.8))
     assert assign_detections(labels, found).tolist() == [0]
     assert compute_errors(labels, found).u_px.tolist() == [90.0]
     assert compute_errors(labels, found).depth_m.tolist() == [1.0]
 
 
 def test_two_labels_are_assigned_at_least_total_distance() -> None:
-    labels = points((3, 0, 0, 1, 1), (3, 10, 0, 1, 1))
-    # Greedily the first label would take u = 4 and leave 30 to the second.
-    found = points((3, 9, 0, 1, 0.9), (3, -20, 0, 1, 0.8), (3, 0, 0, 1, 0.7))
+    labels = build_points((3, 0, 0, 1, 1), (3, 10, 0, 1, 1))
+    # A greedy assignment would give u = 9 to the first label and leave 30 px to the second.
+    # The third detection is on the first label, but only the two most confident take part.
+    found = build_points((3, 9, 0, 1, 0.9), (3, -20, 0, 1, 0.8), (3, 0, 0, 1, 0.7))
     assert assign_detections(labels, found).tolist() == [1, 0]
 
 
-def test_a_label_without_a_detection_is_infinitely_far() -> None:
-    labels = points((0, 0, 0, 1, 1), (1, 0, 0, 1, 1), (1, 50, 0, 1, 1))
-    found = points((1, 49, 0, 1, 0.9))
+def test_a_label_without_a_detection_has_an_infinite_error() -> None:
+    labels = build_points((0, 0, 0, 1, 1), (1, 0, 0, 1, 1), (1, 50, 0, 1, 1))
+    found = build_points((1, 49, 0, 1, 0.9))
     assert assign_detections(labels, found).tolist() == [-1, -1, 0]
     assert compute_errors(labels, found).norm_px.tolist() == [np.inf, np.inf, 1.0]
-    assert np.isnan(compute_errors(labels, points()).depth_m).all()
+    assert np.isnan(compute_errors(labels, build_points()).depth_m).all()
 
 
-def test_each_label_is_hit_once_in_order_of_confidence() -> None:
-    labels = points((0, 10, 10, 1, 1), (0, 20, 10, 1, 1))
-    found = points(
+def test_each_label_matches_once_in_order_of_confidence() -> None:
+    labels = build_points((0, 10, 10, 1, 1), (0, 20, 10, 1, 1))
+    found = build_points(
         (0, 12, 10, 1, 0.9), (0, 11, 10, 1, 0.8), (0, 200, 10, 1, 0.7), (1, 10, 10, 1, 0.9)
     )
     assert match_within_radius(labels, found, 16).tolist() == [0, 1, -1, -1]
     assert match_within_radius(labels, found, 8).tolist() == [0, -1, -1, -1]
-    assert match_within_radius(points(), found, 16).tolist() == [-1] * 4
-    assert match_within_radius(labels, points(), 16).tolist() == []
+    assert match_within_radius(build_points(), found, 16).tolist() == [-1] * 4
+    assert match_within_radius(labels, build_points(), 16).tolist() == []
 
 
-def test_the_radius_itself_is_a_hit() -> None:
-    assert match_within_radius(points((0, 0, 0, 1, 1)), points((0, 0, 16, 1, 1)), 16).tolist() == [
-        0
-    ]
+def test_a_detection_at_the_radius_matches() -> None:
+    assert match_within_radius(
+        build_points((0, 0, 0, 1, 1)), build_points((0, 0, 16, 1, 1)), 16
+    ).tolist() == [0]
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -92,7 +93,7 @@ def test_detections_match_within_their_image_only(seed: int) -> None:
         def rows(count: int) -> list[tuple[int, float, float, float, float]]:
             return [(image, *(rng.random(2) * 50), 1.0, 1.0) for _ in range(count)]
 
-        return points(*rows(rng.integers(0, 4))), points(*rows(rng.integers(0, 5)))
+        return build_points(*rows(rng.integers(0, 4))), build_points(*rows(rng.integers(0, 5)))
 
     parts = [some(0) for _ in range(6)]
     first = np.arange(6)
@@ -117,10 +118,11 @@ def test_detections_match_greedily_to_the_nearest_free_label(
     found_rows: list[tuple[int, float, float]],
     radius_px: float,
 ) -> None:
-    labels = points(*[(*row, 1, 1) for row in label_rows])
-    found = points(*[(*row, 1, 1) for row in found_rows])
+    labels = build_points(*[(*row, 1, 1) for row in label_rows])
+    found = build_points(*[(*row, 1, 1) for row in found_rows])
     free, wanted = set(range(len(label_rows))), []
-    for image, u, v in found_rows:  # as they stand: the most confident of an image first
+    # Rows of equal confidence are matched in their order.
+    for image, u, v in found_rows:
         near = [
             (np.hypot(label_rows[k][1] - u, label_rows[k][2] - v), k)
             for k in free

@@ -21,7 +21,7 @@ def test_locanet_has_the_published_number_of_parameters() -> None:
 
 
 @pytest.mark.heavy
-def test_the_small_networks_keep_to_their_budget() -> None:
+def test_small_networks_have_documented_parameters_and_operations() -> None:
     assert count_parameters(build_network("dmrl-nano")) == 24_836
     assert count_macs(build_network("dmrl-nano")) == 57_720_320
     assert count_parameters(build_network("dmrl-nano-fine")) == 24_740
@@ -44,7 +44,7 @@ def test_receptive_field_has_its_documented_width(name: str, wide_px: int) -> No
 
 
 @pytest.mark.parametrize("name", ARCHITECTURES)
-def test_layers_are_such_as_an_int8_path_carries(name: str) -> None:
+def test_networks_use_only_layers_that_int8_export_supports(name: str) -> None:
     kinds = (torch.nn.Conv2d, torch.nn.BatchNorm2d, torch.nn.ReLU)
     leaves = [m for m in build_network(name).modules() if not list(m.children())]
     assert all(isinstance(leaf, kinds) for leaf in leaves)
@@ -52,7 +52,7 @@ def test_layers_are_such_as_an_int8_path_carries(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ARCHITECTURES)
-def test_every_network_gives_one_cell_per_stride(name: str) -> None:
+def test_every_network_has_a_cell_for_each_stride(name: str) -> None:
     network = build_network(name).eval()
     rows, cols = 224 // network.stride_px, 320 // network.stride_px
     with torch.no_grad():
@@ -100,7 +100,7 @@ def test_unknown_architecture_error_lists_known_ones() -> None:
 
 
 @pytest.mark.parametrize("name", [name for name in ARCHITECTURES if name != "locanet"])
-def test_kernels_begin_as_wide_as_keeps_the_size_of_gradients(name: str) -> None:
+def test_initial_kernels_keep_the_variance_of_gradients(name: str) -> None:
     *convs, head = (m for m in build_network(name).modules() if isinstance(m, torch.nn.Conv2d))
     for conv in convs:
         outs = conv.out_channels // conv.groups

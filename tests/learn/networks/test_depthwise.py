@@ -25,7 +25,7 @@ def test_depthwise_gradients_equal_torch(
         torch.testing.assert_close(a, b, rtol=1e-10, atol=1e-10)
 
 
-def test_an_odd_size_and_half_precision_work_too() -> None:
+def test_depthwise_accepts_odd_sizes_and_half_precision() -> None:
     layer = DepthwiseConv(6, stride=2)
     assert layer(torch.randn(1, 6, 7, 9)).shape == (1, 6, 4, 5)
     with torch.autocast("cpu", torch.bfloat16):

@@ -18,8 +18,8 @@ WIDTHS = (3, 8, 16, 32, 64)
 Variables = dict[str, NDArray[np.float32]]
 
 
-def variables() -> Variables:
-    """Every variable of a published file, drawn at random, by its place in the file."""
+def draw_variables() -> Variables:
+    """Draw a random value of every variable of a published file, by its path in the file."""
     rng = np.random.default_rng(0)
     out: Variables = {}
     for k in range(4):
@@ -33,15 +33,19 @@ def variables() -> Variables:
     return {name: value.astype(np.float32) for name, value in out.items()}
 
 
-def write(path: Path, values: Variables) -> Path:
+def write_weights(path: Path, values: Variables) -> Path:
+    """Write variables to an HDF5 file as Keras does; return its path."""
     with h5py.File(path, "w") as file:
         for name, value in values.items():
             file[f"model_weights/{name}"] = value
     return path
 
 
-def by_hand(values: Variables, image: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The network written out in NumPy, channels last, as Keras computes it."""
+def compute_by_hand(values: Variables, image: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return outputs (rows, columns, 2) of the network in NumPy, as Keras computes them.
+
+    The image (height, width, 3) has values from -1 to 1.
+    """
     x = image
     for k in range(4):
         tail = f"_{k}" if k else ""
@@ -64,34 +68,34 @@ def by_hand(values: Variables, image: NDArray[np.float64]) -> NDArray[np.float64
 
 
 def test_keras_weights_give_the_outputs_of_keras(tmp_path: Path) -> None:
-    values = variables()
-    network = load_model(write(tmp_path / "weights.h5", values)).network
+    values = draw_variables()
+    network = load_model(write_weights(tmp_path / "weights.h5", values)).network
     pixels = np.random.default_rng(1).integers(0, 256, (16, 24, 3), np.uint8)
     with torch.no_grad():
         got = network(normalize_images(torch.from_numpy(pixels)[None].permute(0, 3, 1, 2)))[0]
-    wanted = by_hand(values, pixels / 128 - 1)
+    wanted = compute_by_hand(values, pixels / 128 - 1)
     np.testing.assert_allclose(got.permute(1, 2, 0).numpy(), wanted, rtol=1e-3, atol=1e-2)
 
 
 def test_a_layer_of_another_shape_is_named_with_both_shapes(tmp_path: Path) -> None:
-    values = variables()
+    values = draw_variables()
     values["conv2d_2/conv2d_2/kernel:0"] = np.zeros((3, 3, 16, 48), np.float32)
-    path = write(tmp_path / "weights.h5", values)
+    path = write_weights(tmp_path / "weights.h5", values)
     text = r"conv2d_2/kernel has shape \(3, 3, 16, 48\), locanet needs \(3, 3, 16, 32\)"
     with pytest.raises(ModelError, match=text):
         load_keras_weights(path)
 
 
 def test_a_missing_layer_is_named(tmp_path: Path) -> None:
-    values = variables()
+    values = draw_variables()
     del values["batch_normalization_3/batch_normalization_3/gamma:0"]
-    path = write(tmp_path / "weights.h5", values)
+    path = write_weights(tmp_path / "weights.h5", values)
     with pytest.raises(ModelError, match="has no batch_normalization_3/gamma"):
         load_keras_weights(path)
 
 
 def test_file_cut_short_gives_one_line_error(tmp_path: Path) -> None:
-    whole = write(tmp_path / "weights.h5", variables()).read_bytes()
+    whole = write_weights(tmp_path / "weights.h5", draw_variables()).read_bytes()
     path = tmp_path / "cut.h5"
     path.write_bytes(whole[: len(whole) // 2])
     with pytest.raises(ModelError, match=r"cut\.h5 cannot be read"):
@@ -99,7 +103,7 @@ def test_file_cut_short_gives_one_line_error(tmp_path: Path) -> None:
 
 
 def test_without_h5py_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = write(tmp_path / "weights.h5", variables())
+    path = write_weights(tmp_path / "weights.h5", draw_variables())
     monkeypatch.setattr(hdf5_arrays, "find_spec", lambda _: None)
     with pytest.raises(MissingExtra, match=r"pip install 'dmrl\[keras\]'"):
         load_model(path)
@@ -114,9 +118,9 @@ def test_published_weights_load(data: Path, name: str) -> None:
 
 @pytest.mark.parametrize("kind", ["soft", "external", "raw file", "virtual"])
 def test_external_hdf5_links_are_not_followed(tmp_path: Path, kind: str) -> None:
-    """A file of a stranger must not bring in what stands in other files of ours."""
-    ours, key = write(tmp_path / "ours.h5", variables()), "conv2d_4/conv2d_4/bias:0"
-    path = write(tmp_path / "w.h5", {k: v for k, v in variables().items() if k != key})
+    """A downloaded weight file must not read the content of other files."""
+    ours, key = write_weights(tmp_path / "ours.h5", draw_variables()), "conv2d_4/conv2d_4/bias:0"
+    path = write_weights(tmp_path / "w.h5", {k: v for k, v in draw_variables().items() if k != key})
     (tmp_path / "secret.bin").write_bytes(np.ones(2, np.float32).tobytes())
     with h5py.File(path, "a") as file:
         at = f"model_weights/{key}"

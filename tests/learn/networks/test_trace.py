@@ -1,4 +1,4 @@
-"""What a network does, operation by operation, whether it is said with modules or functions."""
+"""Traces of networks into operations, from modules and from functions."""
 
 from collections.abc import Callable
 from typing import Any
@@ -14,7 +14,7 @@ from dmrl.learn.networks.trace import Op, trace_operations
 
 
 class Small(Network):
-    """A convolution, some step, and a convolution."""
+    """A network of a convolution, a given step and another convolution."""
 
     def __init__(self, step: Callable[[Tensor], Tensor], bias: bool = True) -> None:
         super().__init__()
@@ -28,8 +28,8 @@ class Small(Network):
         return out
 
 
-def between(step: Any) -> list[Op]:
-    """The operations of a step."""
+def trace_step(step: Any) -> list[Op]:
+    """Return the operations of a step, traced between two convolutions."""
     image, first, *found, last, output = trace_operations(Small(step))
     assert (image.kind, first.sources, last.kind) == ("image", (image.name,), "conv")
     assert (output.kind, output.sources) == ("output", (last.name,))
@@ -53,27 +53,27 @@ def between(step: Any) -> list[Op]:
     ],
 )
 def test_max_pool_is_traced_from_module_and_function(step: Any, settings: dict[str, Any]) -> None:
-    (pool,) = between(step)
+    (pool,) = trace_step(step)
     assert (pool.kind, pool.settings) == ("max_pool", settings)
 
 
 def test_functions_are_traced_by_kind_and_no_ops_are_skipped() -> None:
     for step in (nn.ReLU(), torch.relu, relu, lambda x: x.relu()):
-        assert [op.kind for op in between(step)] == ["relu"]
+        assert [op.kind for op in trace_step(step)] == ["relu"]
     for nothing in (nn.Identity(), nn.Dropout(0.5), lambda x: x.float().contiguous().clone()):
-        assert between(nothing) == []
-    twice = between(lambda x: relu(relu(x)))
+        assert trace_step(nothing) == []
+    twice = trace_step(lambda x: relu(relu(x)))
     assert [op.name for op in twice] == ["relu", "relu_1"]
     assert twice[1].sources == ("relu",)
-    (added,) = between(lambda x: x + x)
+    (added,) = trace_step(lambda x: x + x)
     assert (added.kind, added.sources) == ("add", ("first", "first"))
     for odd in (lambda x: x + 1, lambda x: torch.add(x, x, alpha=2)):
-        assert [op.kind for op in between(odd)] == ["add of a number"]
-    (joined,) = between(lambda x: torch.cat([x, x], 1))
+        assert [op.kind for op in trace_step(odd)] == ["add of a number"]
+    (joined,) = trace_step(lambda x: torch.cat([x, x], 1))
     assert (joined.kind, joined.sources) == ("concatenate", ("first", "first"))
 
 
-def test_convolutions_and_norms_bring_their_numbers() -> None:
+def test_traced_convolutions_and_norms_have_their_settings_and_values() -> None:
     norm = nn.BatchNorm2d(4)
     with torch.no_grad():
         for values in (norm.weight, norm.bias, norm.running_mean):

@@ -1,4 +1,4 @@
-"""The consistency loss: images are compared by odometry, or between two robots."""
+"""The consistency loss, which compares two images of one robot or of two robots."""
 
 from pathlib import Path
 
@@ -17,14 +17,15 @@ LENS_PX = AIDECK_PINHOLE.image_from_optical[[0, 1, 0, 1], [0, 1, 2, 2]]
 CELL_PX = 8
 
 
-def pose_of(
+def build_pose(
     time_s: float, xyz: tuple[float, float, float], *angles: float, camera: int = 0
 ) -> np.ndarray:
+    """Return a pose row of a camera: time, position, yaw, roll, pitch, lens and camera number."""
     return np.array([time_s, *xyz, *angles, *LENS_PX, camera], np.float32)
 
 
-def cell_of(world: np.ndarray, pose: np.ndarray) -> tuple[float, float, float]:
-    """Column, row (cells, from the corner) and depth of a point in a camera."""
+def project_to_cell(world: np.ndarray, pose: np.ndarray) -> tuple[float, float, float]:
+    """Return column and row in cells from the image's corner, and depth, of a world point."""
     yaw, roll, pitch = pose[4:7]
     c, s = np.cos(yaw), np.sin(yaw)
     level = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]) @ (world - pose[1:4])
@@ -33,12 +34,16 @@ def cell_of(world: np.ndarray, pose: np.ndarray) -> tuple[float, float, float]:
     return (cx - fx * y / x) / CELL_PX, (cy - fy * z / x) / CELL_PX, x
 
 
-def see(places: list[np.ndarray], poses: list[np.ndarray], confidence: float = 0.8) -> list:
-    """Maps of a pair of images that show a peer, each at its place."""
+def draw_maps(places: list[np.ndarray], poses: list[np.ndarray], confidence: float = 0.8) -> list:
+    """Return maps of a pair of images that show a peer, each at its own position.
+
+    They are confidence (2, 28, 40), log depth (2, 28, 40), offset (2, 2, 28, 40) and poses (2, n),
+    whose lenses are in cells.
+    """
     sure, log_depth = torch.full((2, 28, 40), 0.001), torch.zeros(2, 28, 40)
     offset = torch.zeros(2, 2, 28, 40)
     for k, (place, pose) in enumerate(zip(places, poses, strict=True)):
-        u, v, depth = cell_of(place, pose)
+        u, v, depth = project_to_cell(place, pose)
         sure[k, int(v), int(u)], log_depth[k, int(v), int(u)] = confidence, np.log(depth)
         offset[k, :, int(v), int(u)] = torch.tensor([u % 1 - 0.5, v % 1 - 0.5])
     lens = torch.from_numpy(np.stack(poses))
@@ -46,65 +51,68 @@ def see(places: list[np.ndarray], poses: list[np.ndarray], confidence: float = 0
     return [sure, log_depth, offset, lens]
 
 
-def test_a_peak_is_carried_to_where_the_peer_is_in_the_other_image() -> None:
+def test_a_peak_supports_the_position_of_the_peer_in_the_other_image() -> None:
     peer = np.array([1.2, 0.1, 1.1])
     poses = [
-        pose_of(0.0, (0.0, 0.0, 1.0), 0.1, 0.05, -0.04),
-        pose_of(0.2, (0.2, -0.15, 1.05), 0.3, -0.06, 0.08),
+        build_pose(0.0, (0.0, 0.0, 1.0), 0.1, 0.05, -0.04),
+        build_pose(0.2, (0.2, -0.15, 1.05), 0.3, -0.06, 0.08),
     ]
-    _, support, depth_m = compare(*see([peer, peer], poses))
+    _, support, depth_m = compare(*draw_maps([peer, peer], poses))
     for k, pose in enumerate(poses):
-        u, v, depth = cell_of(peer, pose)
+        u, v, depth = project_to_cell(peer, pose)
         assert divmod(int(support[k].argmax()), 40) == (int(v), int(u))
         assert float(depth_m[k, int(v), int(u)]) == pytest.approx(depth, rel=1e-4)
     assert float(support.max()) > 0.5
 
 
-def test_what_two_images_agree_on_is_believed_and_a_single_alarm_is_not() -> None:
+def test_agreeing_images_raise_confidence_and_disagreeing_ones_do_not() -> None:
     peer, alarm = np.array([1.2, 0.1, 1.0]), np.array([1.0, -0.5, 1.0])
-    poses = [pose_of(0.1 * k, (0.05 * k, 0.0, 1.0), 0.0, 0.0, 0.0) for k in range(2)]
+    poses = [build_pose(0.1 * k, (0.05 * k, 0.0, 1.0), 0.0, 0.0, 0.0) for k in range(2)]
     for places, grows in (([peer, peer], True), ([peer, alarm], False)):
-        probability, _, _ = compare(*see(places, poses, confidence=0.5))
+        probability, _, _ = compare(*draw_maps(places, poses, confidence=0.5))
         assert bool((probability.amax(dim=(1, 2)) > 0.5).all()) is grows
 
 
-def face_each_other() -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """Two robots 1.5 m apart, one 0.2 m higher, each with its own origin; and where each sees."""
+def build_facing_pair() -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Return positions at which two robots see each other, and their poses.
+
+    The robots are 1.5 m apart, one of them 0.2 m higher, and each has its own origin.
+    """
     poses = [
-        pose_of(0.1, (0.0, 0.0, 1.0), 0.0, 0.05, -0.04, camera=0),
-        pose_of(0.1, (7.0, 2.0, 1.2), 2.0, -0.06, 0.08, camera=1),
+        build_pose(0.1, (0.0, 0.0, 1.0), 0.0, 0.05, -0.04, camera=0),
+        build_pose(0.1, (7.0, 2.0, 1.2), 2.0, -0.06, 0.08, camera=1),
     ]
     ahead = np.array([np.cos(2.0), np.sin(2.0), 0.0])
     return [np.array([1.5, 0.0, 1.2]), poses[1][1:4] + 1.5 * ahead + [0.0, 0.0, -0.2]], poses
 
 
 def test_two_robots_that_see_each_other_support_each_other() -> None:
-    places, poses = face_each_other()
-    sure, log_depth, offset, lens = see(places, poses, confidence=0.5)
-    log_depth[1] += np.log(1.1)  # the second robot overestimates the depth by a tenth
+    places, poses = build_facing_pair()
+    sure, log_depth, offset, lens = draw_maps(places, poses, confidence=0.5)
+    log_depth[1] += np.log(1.1)  # The second robot overestimates the depth by a tenth.
     probability, support, _ = compare(sure, log_depth, offset, lens)
     for k, (place, pose) in enumerate(zip(places, poses, strict=True)):
-        u, v, _ = cell_of(place, pose)
+        u, v, _ = project_to_cell(place, pose)
         assert float(probability[k, int(v), int(u)]) > 0.6
-    assert not support.any()  # the distance is no target
+    assert not support.any()  # Pairs of two robots give no target for depth.
 
 
 @pytest.mark.parametrize("change", ["farther", "higher"])
 def test_a_robot_elsewhere_neither_supports_nor_refutes(change: str) -> None:
-    places, poses = face_each_other()
+    places, poses = build_facing_pair()
     if change == "farther":
         places[1] = poses[1][1:4] + 2 * (places[1] - poses[1][1:4])
     else:
         places[1] = places[1] + [0.0, 0.0, 0.5]
-    sure, *rest = see(places, poses, confidence=0.5)
+    sure, *rest = draw_maps(places, poses, confidence=0.5)
     probability, _, _ = compare(sure, *rest)
     torch.testing.assert_close(probability, sure, atol=0.01, rtol=0.01)
 
 
 def draw_numbers(images: int, cameras: int, offset_s: float, flights: list[int]) -> np.ndarray:
-    """Draw pairs of images of some cameras in turn; return (M, 2) their numbers."""
+    """Draw pairs of images of some cameras; return the numbers (M, 2) of their images."""
     poses = [
-        pose_of(0.1 * k + offset_s * c, (0.0, 0.0, 1.0), 0.0, 0.0, 0.0, camera=c)
+        build_pose(0.1 * k + offset_s * c, (0.0, 0.0, 1.0), 0.0, 0.0, 0.0, camera=c)
         for c in range(cameras)
         for k in range(images)
     ]
@@ -133,9 +141,9 @@ def test_images_of_two_robots_at_the_same_time_are_paired_first(images: int, mut
     assert (numbers[two, 0] % images == numbers[two, 1] % images).all()
 
 
-def test_images_without_labels_count_for_no_other_loss() -> None:
+def test_images_without_labels_have_only_the_consistency_loss() -> None:
     network = build_network("locanet")
-    poses = torch.from_numpy(np.stack([pose_of(0.1 * k, (0, 0, 1), 0, 0, 0) for k in range(2)]))
+    poses = torch.from_numpy(np.stack([build_pose(0.1 * k, (0, 0, 1), 0, 0, 0) for k in range(2)]))
     rng = torch.Generator().manual_seed(1)
     pixels = torch.randint(0, 255, (2, 3, 224, 320), generator=rng, dtype=torch.uint8)
     batch = Batch(pixels, torch.full((2, 1, 11), torch.nan), poses)

@@ -1,4 +1,4 @@
-"""Processes that are started here; what they train is in tests/stages/test_train.py."""
+"""Groups of processes; tests/stages/test_train.py tests a training in them."""
 
 import importlib
 import multiprocessing
@@ -17,9 +17,9 @@ from dmrl.learn.training.distributed import ProcessGroup, run_distributed
 
 @pytest.fixture
 def work(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    """Functions that another process can import.
+    """Return the module of functions that the processes import.
 
-    Those processes come of one that has loaded torch, as each of them would take seconds to.
+    Processes are forked from one that has loaded torch, because each would take seconds to.
     """
     monkeypatch.syspath_prepend(Path(__file__).parents[1])
     forked = multiprocessing.get_context("forkserver")
@@ -31,24 +31,24 @@ def work(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
 @pytest.mark.heavy
 def test_all_processes_run_and_rank_0_returns(work: ModuleType) -> None:
     threads = torch.get_num_threads()
-    assert run_distributed(2, partial(work.rank_sum, more=10)) == 11
+    assert run_distributed(2, partial(work.sum_ranks, more=10)) == 11
     assert torch.get_num_threads() == threads
     assert not distributed.is_initialized()
 
 
 def test_killed_process_gives_one_line_error(work: ModuleType) -> None:
     with pytest.raises(SettingError, match=r"one of the 2 processes was killed.*--resume"):
-        run_distributed(2, work.half_dies)
+        run_distributed(2, work.kill_others)
     assert not distributed.is_initialized()
 
 
 def test_failure_of_rank_0_ends_the_other_processes(work: ModuleType) -> None:
     with pytest.raises(RuntimeError, match="a bug"):
-        run_distributed(2, work.first_fails)
+        run_distributed(2, work.fail_first)
     assert not distributed.is_initialized()
 
 
-def test_a_start_that_failed_leaves_nothing_to_the_next(
+def test_processes_start_after_a_start_that_failed(
     work: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with monkeypatch.context() as short:
@@ -56,7 +56,7 @@ def test_a_start_that_failed_leaves_nothing_to_the_next(
         with pytest.raises(SettingError, match=r"the 2 processes did not find each other.*0\.1 s"):
             group._join_group((tmp_path / "meeting").as_uri(), 0, 2, group.ProcessGroup)
     assert not distributed.is_initialized()
-    assert run_distributed(2, partial(work.rank_sum, more=0)) == 1
+    assert run_distributed(2, partial(work.sum_ranks, more=0)) == 1
 
 
 def test_collective_timeout_is_longer_than_the_join_timeout(tmp_path: Path) -> None:

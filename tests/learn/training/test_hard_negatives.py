@@ -12,7 +12,7 @@ from dmrl.learn.training.hard_negatives import (
 
 
 class Bright(Network):
-    """Believes in a robot where the picture is bright."""
+    """A network whose confidence is the brightness of the image."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -23,8 +23,8 @@ class Bright(Network):
         return torch.cat([light, self.scale * light], dim=1)
 
 
-def examples() -> ExampleSet:
-    """Two images with a robot, then three without: dark, grey and bright."""
+def build_examples() -> ExampleSet:
+    """Return two images with a robot, then three without: dark, grey and bright."""
     pixels = np.zeros((5, 16, 24, 3), np.uint8)
     pixels[3], pixels[4] = 128, 255
     robots = np.full((5, 1, len(ROBOT_FIELDS)), np.nan, np.float32)
@@ -35,9 +35,9 @@ def examples() -> ExampleSet:
 def test_confident_negatives_are_sampled_more_often() -> None:
     network = Bright().train()
     assert network.channels == DETECTION_CHANNELS
-    believed = compute_peak_confidences(network, examples(), np.arange(5))
+    believed = compute_peak_confidences(network, build_examples(), np.arange(5))
     assert (np.diff(believed[2:]) > 0).all()
-    shares = mine_hard_negatives(network, examples(), None, 0.4)
+    shares = mine_hard_negatives(network, build_examples(), None, 0.4)
     assert shares is not None
     assert network.training
     assert shares.mean() == pytest.approx(1)
@@ -47,20 +47,24 @@ def test_confident_negatives_are_sampled_more_often() -> None:
 
 
 def test_images_with_a_robot_keep_their_proportions() -> None:
-    shares = mine_hard_negatives(Bright(), examples(), np.array([1.0, 3.0, 1.0, 0.5, 0.5]), 0.2)
+    shares = mine_hard_negatives(
+        Bright(), build_examples(), np.array([1.0, 3.0, 1.0, 0.5, 0.5]), 0.2
+    )
     assert shares is not None
     assert shares[1] == pytest.approx(3 * shares[0])
     assert shares[:2].sum() / shares.sum() == pytest.approx(0.8)
 
 
-def test_an_image_without_a_share_is_not_mined() -> None:
-    shares = mine_hard_negatives(Bright(), examples(), np.array([1.0, 1.0, 1.0, 1.0, 0.0]), 0.4)
+def test_an_image_of_zero_share_is_not_mined() -> None:
+    shares = mine_hard_negatives(
+        Bright(), build_examples(), np.array([1.0, 1.0, 1.0, 1.0, 0.0]), 0.4
+    )
     assert shares is not None
     assert shares[4] == 0
     assert shares[2:].sum() / shares.sum() == pytest.approx(0.4)
 
 
-def test_without_images_of_either_kind_nothing_changes() -> None:
-    full = examples().select(np.array([True, True, False, False, False]))
+def test_without_empty_images_nothing_is_mined() -> None:
+    full = build_examples().select(np.array([True, True, False, False, False]))
     assert find_empty_images(full).tolist() == [False, False]
     assert mine_hard_negatives(Bright(), full, None, 0.4) is None

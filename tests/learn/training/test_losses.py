@@ -59,7 +59,7 @@ def test_unknown_depth_has_no_gradient(kind: DepthLoss) -> None:
     assert log_depth.grad[0, 0, 0] == pytest.approx(-1 if kind == "log" else 2 - 2 * math.e)
 
 
-def test_without_focus_it_is_cross_entropy_and_cells_can_weigh_less() -> None:
+def test_confidence_loss_without_focus_is_weighted_cross_entropy() -> None:
     logit, label = torch.tensor([[[0.5, -2.0]]]), torch.tensor([[[0.7, 0.0]]])
     p = logit.sigmoid()
     entropy = -(label * p.log() + (1 - label) * (1 - p).log())
@@ -97,7 +97,7 @@ def test_spread_loss_is_minimal_at_the_mean_error_without_depth_gradient() -> No
     assert (spread.grad > 0).all()
 
 
-def test_class_loss_is_the_papers_and_only_where_the_class_is_known() -> None:
+def test_class_loss_is_the_published_one_in_cells_of_known_class() -> None:
     logits = torch.tensor([[[[1.0, 5.0, 2.0]], [[-1.0, 5.0, 2.0]]]])
     class_id = torch.tensor([[[0, -1, 1]]])
     weight = torch.tensor([[[0.5, 1.0, 0.0]]])
@@ -119,7 +119,7 @@ def test_every_weight_changes_the_loss_by_its_own_term(key: str) -> None:
     network = build_network("dmrl-nano", extra=settings.extra_channels).eval()
     robots = torch.tensor([[[20.0, 12.0, 1.5, 1.0, 1.0, 0.1, 15.0, 8.0, 25.0, 16.0, 1.0]]])
     wanted = build_targets(robots.repeat(2, 1, 1), (4, 5), sigma_cells=0.7)
-    # A pair of images of a camera at rest, whose lens is given in cells.
+    # The poses are of two images of a camera at rest, with its lens in cells.
     wanted = wanted._replace(poses=torch.tensor([[0.0] * 7 + [5.0, 5.0, 2.5, 2.0, 0.0]] * 2))
     with torch.no_grad():
         out = unbind_channels(network.channels, network(torch.ones(2, 3, 32, 40)))
@@ -132,7 +132,7 @@ def test_every_weight_changes_the_loss_by_its_own_term(key: str) -> None:
     torch.testing.assert_close(after, before * factors)
 
 
-def test_a_term_is_nothing_to_a_network_that_lacks_its_channels() -> None:
+def test_a_loss_term_is_zero_for_a_network_without_its_channels() -> None:
     network = build_network("locanet").eval()
     wanted = build_targets(torch.full((1, 1, 11), math.nan), (4, 5), sigma_cells=0.7)
     with torch.no_grad():
@@ -155,7 +155,7 @@ def test_predicted_spread_is_clamped_at_one_hundredth() -> None:
 
 
 @pytest.mark.parametrize("focus", [0.5, 1.0, 3.0])
-def test_the_focus_is_an_exponent(focus: float) -> None:
+def test_the_focus_is_the_exponent_of_the_error(focus: float) -> None:
     logit, label = torch.tensor([[[0.5]]]), torch.tensor([[[0.9]]])
     wrong = abs(0.9 - 1 / (1 + math.exp(-0.5)))
     plain = float(confidence_loss(logit, label, focus=0.0))

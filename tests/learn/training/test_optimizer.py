@@ -7,7 +7,7 @@ from dmrl.learn.training.optimizer import Muon, build_optimizer, orthogonalize
 
 
 @pytest.mark.parametrize("shape", [(48, 48), (48, 32), (32, 144)])
-def test_every_direction_of_an_update_is_of_about_the_same_size(shape: tuple[int, int]) -> None:
+def test_orthogonalized_updates_have_similar_singular_values(shape: tuple[int, int]) -> None:
     torch.manual_seed(0)
     u, _, v = torch.linalg.svd(torch.randn(shape), full_matrices=False)
     before = torch.logspace(0, -2, min(shape))
@@ -26,7 +26,7 @@ def test_muon_takes_the_kernels_that_mix_channels() -> None:
     mixing = {id(p) for p in optimizer.param_groups[0]["params"]}
     names = [name for name, p in network.named_parameters() if id(p) in mixing]
     assert len(names) == 9
-    assert "body.1.0.weight" in names  # the second convolution
+    assert "body.1.0.weight" in names  # This is the second convolution.
     assert not {"body.0.0.weight", "body.2.depthwise.0.weight", "head.weight"} & set(names)
     every = [p for group in optimizer.param_groups for p in group["params"]]
     assert {id(p) for p in every} == {id(p) for p in network.parameters()}
@@ -55,7 +55,7 @@ def test_a_step_of_muon_is_as_large_as_one_of_adam_and_downhill() -> None:
     assert 0.1 < sizes["muon"] / sizes["adam"] < 1.0
 
 
-def test_without_weight_decay_adam_is_the_papers() -> None:
+def test_adam_is_used_without_weight_decay_and_adamw_with_it() -> None:
     assert type(build_optimizer(build_network("locanet"), "adam", 0.0)) is torch.optim.Adam
     assert type(build_optimizer(build_network("locanet"), "adam", 0.1)) is torch.optim.AdamW
 
@@ -69,8 +69,8 @@ def test_only_kernels_decay(name: str) -> None:
         assert decays[id(parameter)] == (0.01 if parameter.ndim > 1 else 0.0)
 
 
-def plain_orthogonal(matrix: np.ndarray) -> np.ndarray:
-    """The published iteration, for a matrix no taller than wide."""
+def orthogonalize_plainly(matrix: np.ndarray) -> np.ndarray:
+    """Run the published iteration on a matrix that is not taller than wide."""
     x = matrix / np.linalg.norm(matrix)
     for _ in range(5):
         square = x @ x.T
@@ -98,7 +98,7 @@ def test_muon_steps_equal_the_published_algorithm_and_others_use_adam() -> None:
         muon.step()
         adam.step()
         momentum = 0.95 * momentum + 0.05 * flat
-        update = plain_orthogonal(0.05 * flat + 0.95 * momentum)
+        update = orthogonalize_plainly(0.05 * flat + 0.95 * momentum)
         wanted = wanted * (1 - rate * decay) - rate * 0.2 * 27**0.5 * update
         assert kernel.detach().numpy().reshape(4, 27) == pytest.approx(wanted, abs=1e-5)
         assert kernel.grad is None
@@ -110,12 +110,12 @@ def test_muon_steps_equal_the_published_algorithm_and_others_use_adam() -> None:
 def test_orthogonalize_wide_and_tall_matrices(rows: int, columns: int) -> None:
     matrix = np.random.default_rng(rows).normal(size=(rows, columns)).astype(np.float32)
     lying = matrix.T if rows > columns else matrix
-    wanted = plain_orthogonal(lying)
+    wanted = orthogonalize_plainly(lying)
     found = orthogonalize(torch.from_numpy(matrix)).numpy()
     assert (found.T if rows > columns else found) == pytest.approx(wanted, abs=1e-4)
 
 
-def test_adam_s_epsilon_is_the_paper_s() -> None:
+def test_the_epsilon_of_adam_is_the_published_one() -> None:
     for name, decay in (("adam", 0.0), ("adam", 0.1), ("muon", 0.1)):
         optimizer = build_optimizer(build_network("dmrl-nano"), name, decay)  # type: ignore[arg-type]
         assert {group["eps"] for group in optimizer.param_groups} == {1e-7}

@@ -9,7 +9,7 @@ from tensorboard.summary.writer.record_writer import RecordWriter
 from dmrl.learn.training import tensorboard_log
 
 
-def test_a_full_disk_is_one_error_and_no_traceback_of_a_thread(
+def test_a_full_disk_gives_one_error_and_no_traceback_of_a_thread(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def full(_: RecordWriter, data: bytes) -> None:

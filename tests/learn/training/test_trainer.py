@@ -19,14 +19,14 @@ from dmrl.learn.training.train_step import LOSS_NAMES, WeightEma, compute_losses
 from dmrl.learn.training.trainer import Trainer, build_initial_network, select_device
 from dmrl.learn.training.validation import score_examples
 
-from ..fitting import EVERYTHING, SETTINGS, dots, trained
+from ..fitting import EVERYTHING, SETTINGS, draw_dots, train
 
 
 @pytest.mark.heavy
-def test_same_seed_same_bytes_and_another_seed_others(examples: ExampleSet, tmp_path: Path) -> None:
+def test_the_seed_decides_the_bytes_of_the_weights(examples: ExampleSet, tmp_path: Path) -> None:
     weights = []
     for name, seed in (("a", 0), ("b", 0), ("c", 1)):
-        trained(examples, tmp_path / name, replace(SETTINGS, epochs=1, seed=seed))
+        train(examples, tmp_path / name, replace(SETTINGS, epochs=1, seed=seed))
         weights.append((tmp_path / name / "model.safetensors").read_bytes())
     assert weights[0] == weights[1] != weights[2]
 
@@ -45,9 +45,9 @@ def test_progress_shows_no_loss_until_an_epoch_has_read_one(
 
 @pytest.mark.heavy
 def test_locanet_learns_to_detect_a_dot(tmp_path: Path) -> None:
-    examples = dots(150)
+    examples = draw_dots(150)
     settings = replace(SETTINGS, epochs=12, learning_rate=3e-3)
-    training, network = trained(examples, tmp_path / "run", settings)
+    training, network = train(examples, tmp_path / "run", settings)
     losses = [epoch["loss"] for epoch in training.history]
     assert losses[-1] < losses[0] / 5
     images: NDArray[np.uint8] = np.concatenate(list(examples.pixels))
@@ -60,11 +60,11 @@ def test_locanet_learns_to_detect_a_dot(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_dmrl_nano_learns_to_locate_a_dot_within_its_cell(tmp_path: Path) -> None:
-    examples = dots(64)
+    examples = draw_dots(64)
     settings = TrainConfig(
         epochs=20, batch_size=8, ema_steps=40, rotation_deg=0.0, blur_share=0.0, device="cpu"
     )
-    _, network = trained(examples, tmp_path / "run", settings)
+    _, network = train(examples, tmp_path / "run", settings)
     scored = score_examples(network, examples)
     assert np.median(scored.label_error.norm_px) < 1.0
     assert np.nanmean(np.abs(scored.label_error.depth_m)) < 0.15
@@ -74,18 +74,18 @@ def test_dmrl_nano_learns_to_locate_a_dot_within_its_cell(tmp_path: Path) -> Non
 
 
 @pytest.mark.heavy
-def test_the_kept_weights_are_the_mean_of_those_of_many_steps(tmp_path: Path) -> None:
-    examples, settings = dots(12), replace(EVERYTHING, epochs=2)
-    _, last = trained(examples, tmp_path / "last", replace(settings, ema_steps=0))
-    _, mean = trained(examples, tmp_path / "mean", settings)
-    _, one = trained(examples, tmp_path / "one", replace(settings, ema_steps=1))
+def test_kept_weights_are_averaged_over_ema_steps(tmp_path: Path) -> None:
+    examples, settings = draw_dots(12), replace(EVERYTHING, epochs=2)
+    _, last = train(examples, tmp_path / "last", replace(settings, ema_steps=0))
+    _, mean = train(examples, tmp_path / "mean", settings)
+    _, one = train(examples, tmp_path / "one", replace(settings, ema_steps=1))
     for a, b, c in zip(last.parameters(), mean.parameters(), one.parameters(), strict=True):
         assert not torch.equal(a, b)
         assert torch.isfinite(b).all()
         torch.testing.assert_close(a.detach(), c, rtol=0.2, atol=0.05)
 
 
-def test_the_last_epochs_keep_images_whole() -> None:
+def test_the_last_epochs_are_without_geometric_augmentation() -> None:
     settings = TrainConfig(epochs=10, plain_epochs=3, paste=1.0)
     assert settings.augmentation(6) == replace(settings, plain_epochs=0).augmentation(9)
     plain = settings.augmentation(7)
@@ -96,14 +96,14 @@ def test_the_last_epochs_keep_images_whole() -> None:
 
 @pytest.mark.parametrize("frozen", [0, 1])
 @pytest.mark.heavy
-def test_frozen_norms_are_learnt_but_not_measured(
+def test_frozen_norms_learn_scales_but_keep_their_statistics(
     examples: ExampleSet, tmp_path: Path, frozen: int
 ) -> None:
     settings = replace(SETTINGS, epochs=2, frozen_norm_epochs=frozen)
     training = Trainer(build_initial_network(settings, examples), examples, settings, tmp_path)
     seen: list[dict[str, torch.Tensor]] = []
     for number, _ in enumerate(training.train_steps(), start=1):
-        if number % 7 == 0:  # the end of an epoch: 20 images by threes
+        if number % 7 == 0:  # An epoch of 20 images has 7 steps.
             seen.append({k: v.clone() for k, v in training.network.state_dict().items()})
     first, second = seen
     statistics = {name for name in first if "running_" in name}
@@ -136,9 +136,9 @@ def test_distillation_loss_is_zero_for_an_identical_teacher(examples: ExampleSet
 
 @pytest.mark.slow
 def test_classes_and_the_spread_are_learnt(examples: ExampleSet, tmp_path: Path) -> None:
-    # Squares of class 1 are grey: that is what tells them apart.
-    pixels: NDArray[np.uint8] = np.concatenate(list(dots(64).pixels))
-    robots = dots(64).robots
+    # Squares of class 1 are grey, so that the classes differ.
+    pixels: NDArray[np.uint8] = np.concatenate(list(draw_dots(64).pixels))
+    robots = draw_dots(64).robots
     grey = robots[:, 0, CLASS_ID] == 1
     pixels[grey] = np.minimum(pixels[grey], 120)
     settings = TrainConfig(
@@ -152,7 +152,7 @@ def test_classes_and_the_spread_are_learnt(examples: ExampleSet, tmp_path: Path)
         spread_weight=1.0,
         classes=("a", "b"),
     )
-    _, network = trained(ExampleSet([pixels], robots), tmp_path / "run", settings)
+    _, network = train(ExampleSet([pixels], robots), tmp_path / "run", settings)
     found = decode(*Model(network, "dmrl-nano").grids(pixels))
     assert (found.class_id[:, 0] == grey).mean() > 0.9
     error_m = np.abs(found.depth_m[:, 0] - 1.5)
@@ -160,15 +160,15 @@ def test_classes_and_the_spread_are_learnt(examples: ExampleSet, tmp_path: Path)
 
 
 @pytest.mark.heavy
-def test_a_loss_that_is_no_number_stops_the_training(examples: ExampleSet, tmp_path: Path) -> None:
+def test_a_loss_of_nan_stops_the_training(examples: ExampleSet, tmp_path: Path) -> None:
     wild = replace(SETTINGS, learning_rate=1e7, warmup_epochs=0)
     with pytest.raises(SettingError, match=r"the loss is nan in epoch 1, step 7\. Lower"):
-        trained(examples, tmp_path / "run", wild)
+        train(examples, tmp_path / "run", wild)
 
 
 @pytest.mark.heavy
 def test_tensorboard_gets_loss_and_learning_rate(examples: ExampleSet, tmp_path: Path) -> None:
-    trained(examples, tmp_path / "run")
+    train(examples, tmp_path / "run")
     log = EventAccumulator(str(tmp_path / "run" / "tensorboard"))
     log.Reload()
     assert set(log.Tags()["scalars"]) == {"loss/train", "learning_rate"}
@@ -176,7 +176,7 @@ def test_tensorboard_gets_loss_and_learning_rate(examples: ExampleSet, tmp_path:
 
 
 @pytest.mark.heavy
-def test_validation_is_watched_and_changes_nothing(examples: ExampleSet, tmp_path: Path) -> None:
+def test_validation_does_not_change_the_weights(examples: ExampleSet, tmp_path: Path) -> None:
     weights = []
     for name, watched in (("without", None), ("with", examples)):
         (tmp_path / name).mkdir()
@@ -267,7 +267,7 @@ def test_distillation_weight_is_the_configured_share(examples: ExampleSet) -> No
 
 
 @pytest.mark.parametrize(("width", "height", "fits"), [(48, 32, 1), (44, 32, 0), (48, 28, 0)])
-def test_both_sides_of_images_fit_a_network(width: int, height: int, fits: int) -> None:
+def test_width_and_height_must_divide_into_cells(width: int, height: int, fits: int) -> None:
     robots = np.full((1, 1, len(ROBOT_FIELDS)), np.nan, np.float32)
     images = ExampleSet([np.zeros((1, height, width, 3), np.uint8)], robots)
     if fits:
