@@ -1,4 +1,4 @@
-"""Failures to set up Blender's environment."""
+"""The set-up of Blender's environment, and its failures."""
 
 import shutil
 import subprocess
@@ -12,7 +12,8 @@ from dmrl.rendering import blender_environment
 
 
 @pytest.fixture(autouse=True)
-def _elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def _cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Put the cache, where the environment is made, in a temporary folder."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
 
 
@@ -39,9 +40,9 @@ def test_failed_download_is_reported_and_leaves_no_files(
     assert list((tmp_path / "dmrl").iterdir()) == []
 
 
-def test_an_environment_that_is_there_is_used(tmp_path: Path) -> None:
+def test_an_existing_environment_is_used(tmp_path: Path) -> None:
     python = blender_environment.environment_folder() / "bin" / "python"
     python.parent.mkdir(parents=True)
     python.symlink_to(sys.executable)
     assert blender_environment.find_python() == python
-    assert blender_environment.ensure_environment(lambda _: pytest.fail("nothing to say")) == python
+    assert blender_environment.ensure_environment(lambda _: pytest.fail("a message")) == python

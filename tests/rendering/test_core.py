@@ -8,7 +8,7 @@ from dmrl.rendering.blender.core import limit_to_one_core
 
 
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="cores cannot be chosen here")
-def test_one_core_is_seen_inside_and_all_of_them_afterwards() -> None:
+def test_one_core_is_visible_inside_and_all_of_them_afterwards() -> None:
     before = os.sched_getaffinity(0)
     with pytest.raises(ImportError), limit_to_one_core():
         assert len(os.sched_getaffinity(0)) == 1
@@ -16,7 +16,7 @@ def test_one_core_is_seen_inside_and_all_of_them_afterwards() -> None:
     assert os.sched_getaffinity(0) == before
 
 
-def test_nothing_happens_where_cores_cannot_be_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_systems_without_cpu_affinity_are_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delattr(os, "sched_setaffinity", raising=False)
     monkeypatch.delattr(os, "sched_getaffinity", raising=False)
     with limit_to_one_core():

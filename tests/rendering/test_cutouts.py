@@ -1,4 +1,4 @@
-"""Cut-outs: labels that fit the pixels, and appearance that fits the background."""
+"""Renders of cut-outs: labels that fit the pixels, and colours that fit the background."""
 
 from pathlib import Path
 
@@ -20,7 +20,7 @@ WIDTH_M = 0.2
 
 @pytest.fixture
 def folders(tmp_path: Path) -> tuple[Path, Path]:
-    """A dark cross with alpha, 60 px wide, and grey bright photos."""
+    """Return folders of a cut-out, a dark cross 60 px wide, and of bright grey photos."""
     cutouts, photos = tmp_path / "cutouts", tmp_path / "photos"
     cutouts.mkdir()
     photos.mkdir()
@@ -33,6 +33,7 @@ def folders(tmp_path: Path) -> tuple[Path, Path]:
 
 
 def write_recipe(folder: Path, cutouts: Path, photos: Path | None, more: str = "") -> Path:
+    """Write a render recipe of cut-outs, with further lines of TOML; return its path."""
     recipe = folder / "recipe.toml"
     behind = "" if photos is None else f'backgrounds = "{photos}"\n'
     text = f'kind = "render"\npreset = "cutouts"\ncutouts = "{cutouts}"\n{behind}'
@@ -40,13 +41,14 @@ def write_recipe(folder: Path, cutouts: Path, photos: Path | None, more: str = "
     return recipe
 
 
-def peers_of(out: Path) -> list[list[dict[str, float]]]:
+def read_peers(out: Path) -> list[list[dict[str, float]]]:
+    """Return the labels of the peers in each image of a recording."""
     batches = iter_columns(out, topics.LABELS("cf1"), fields=["peers"])
     return [row for batch in batches for row in batch["peers"].to_pylist()]
 
 
 @pytest.mark.heavy
-def test_labels_fit_the_pixels(tmp_path: Path, folders: tuple[Path, Path]) -> None:
+def test_labels_fit_the_dark_pixels(tmp_path: Path, folders: tuple[Path, Path]) -> None:
     more = "images = 30\ndistorted = false\nempty_share = 0.2\nplace_u = [0.3, 0.7]\n"
     recipe = write_recipe(tmp_path, *folders, more + "place_v = [0.3, 0.7]\n")
     out = tmp_path / "out.mcap"
@@ -55,7 +57,7 @@ def test_labels_fit_the_pixels(tmp_path: Path, folders: tuple[Path, Path]) -> No
     assert 0 < done.empty_images < 30
     camera = find_camera(Path("aideck"))
     checked = 0
-    for sample, peers in zip(read(out, topics.CAMERA_IMAGE("cf1")), peers_of(out), strict=True):
+    for sample, peers in zip(read(out, topics.CAMERA_IMAGE("cf1")), read_peers(out), strict=True):
         rgb = decode(sample.message.data, out).astype(float)
         dark = rgb.mean(axis=2) < rgb.mean(axis=2).max() - 60
         for peer in peers:

@@ -1,4 +1,4 @@
-"""Ranges of renders, presets and shipped recipes."""
+"""Limits of render settings, presets and shipped recipes."""
 
 import pytest
 
@@ -8,7 +8,9 @@ from dmrl.rendering.settings import PRESETS, Settings
 
 
 @pytest.mark.parametrize("name", PRESETS)
-def test_every_preset_can_be_rendered(name: str, tmp_path_factory: pytest.TempPathFactory) -> None:
+def test_every_preset_makes_valid_settings(
+    name: str, tmp_path_factory: pytest.TempPathFactory
+) -> None:
     path = tmp_path_factory.mktemp("recipe") / "r.toml"
     path.write_text(f'kind = "render"\npreset = "{name}"\nimages = 3\n')
     assert read_render_settings(str(path)).images == 3
@@ -18,7 +20,7 @@ def test_every_preset_can_be_rendered(name: str, tmp_path_factory: pytest.TempPa
     ("name", "images"),
     [("synthetic_first_look", 40), ("synthetic_paper", 1000), ("synthetic_large", 20_000)],
 )
-def test_shipped_recipes_hold(name: str, images: int) -> None:
+def test_shipped_recipes_have_their_documented_number_of_images(name: str, images: int) -> None:
     assert read_render_settings(name).images == images
     assert read_render_settings(name, images=2, seed=None).images == 2
 

@@ -1,3 +1,5 @@
+"""Sketches of quadrotors: their pixels, labels and random scenes."""
+
 from dataclasses import replace
 
 import numpy as np
@@ -15,8 +17,8 @@ LEVEL = np.eye(3)
 
 
 @pytest.fixture
-def plain() -> Look:
-    """White background, even light, a sharp and noiseless sensor."""
+def plain_look() -> Look:
+    """Return the look of a white background in even light, seen by a sharp, noiseless sensor."""
     shape = (CAMERA.height_px, CAMERA.width_px, 3)
     return Look(
         background=np.full(shape, 255, np.uint8),
@@ -34,74 +36,79 @@ def plain() -> Look:
     )
 
 
-def at(x: float, y: float, z: float, turn: Array = LEVEL) -> Pose:
-    """A robot at a place in the camera frame."""
+def build_pose(x: float, y: float, z: float, turn: Array = LEVEL) -> Pose:
+    """Return the pose of a robot in the camera frame, in metres."""
     return Pose(np.array([x, y, z]), turn)
 
 
-def dark(sketch: Sketch) -> Array:
-    """(N, 2) pixels (u, v) that are not background."""
+def find_changed_pixels(sketch: Sketch) -> Array:
+    """Return pixels (n, 2) as (u, v) that are not background."""
     return np.argwhere((sketch.rgb < 254).any(axis=2))[:, ::-1] + 0.5
 
 
-def test_a_robot_on_the_left_and_above_is_drawn_there(plain: Look) -> None:
-    sketch = render_sketch(CAMERA, [at(1.0, 0.3, 0.1)], plain)
+def test_a_robot_to_the_left_and_above_is_drawn_at_its_projection(plain_look: Look) -> None:
+    sketch = render_sketch(CAMERA, [build_pose(1.0, 0.3, 0.1)], plain_look)
     np.testing.assert_allclose(
         sketch.uv_px, [[166.90 - 0.3 * 183.73, 77.51 - 0.1 * 184.12]], atol=1e-9
     )
     assert sketch.depth_m.tolist() == [1.0]
-    middle = dark(sketch).mean(axis=0)
+    middle = find_changed_pixels(sketch).mean(axis=0)
     assert np.abs(middle - sketch.uv_px[0]).max() < 3
     assert sketch.visible_share.tolist() == [1.0]
 
 
-def test_rolled_right_side_down_the_right_side_is_lower(plain: Look) -> None:
+def test_a_robot_rolled_to_the_right_is_drawn_lower_on_the_right(plain_look: Look) -> None:
     turn = camera_from_horizontal(0.4, 0.0).T
-    u, v = dark(render_sketch(CAMERA, [at(0.5, 0.0, 0.0, turn)], plain)).T
+    u, v = find_changed_pixels(
+        render_sketch(CAMERA, [build_pose(0.5, 0.0, 0.0, turn)], plain_look)
+    ).T
     assert np.corrcoef(u, v)[0, 1] > 0.3
 
 
-def test_nose_down_its_top_shows_from_behind(plain: Look) -> None:
-    # Seen from behind, the far rotors are lower when the nose is down and higher when up.
+def test_a_pitched_robot_shows_more_height_from_behind(plain_look: Look) -> None:
+    # From behind, the far rotors are lower when the nose is down, and higher when it is up.
     heights = {}
     for pitch in (-0.4, 0.4):
         turn = camera_from_horizontal(0.0, pitch).T
         far = (ROTOR_DISCS.mean(axis=1) @ turn.T)[ROTOR_DISCS.mean(axis=1)[:, 0] > 0]
         heights[pitch] = far[:, 2].mean()
     assert heights[0.4] < 0 < heights[-0.4]
-    down = render_sketch(CAMERA, [at(0.5, 0.0, 0.0, camera_from_horizontal(0, 0.4).T)], plain)
-    level = render_sketch(CAMERA, [at(0.5, 0.0, 0.0)], plain)
+    down = render_sketch(
+        CAMERA, [build_pose(0.5, 0.0, 0.0, camera_from_horizontal(0, 0.4).T)], plain_look
+    )
+    level = render_sketch(CAMERA, [build_pose(0.5, 0.0, 0.0)], plain_look)
     height = [s.box_px[0, 3] - s.box_px[0, 1] for s in (down, level)]
     assert height[0] > 1.5 * height[1]
 
 
-def test_twice_the_distance_is_half_the_size(plain: Look) -> None:
+def test_size_is_inversely_proportional_to_distance(plain_look: Look) -> None:
     boxes = [
-        render_sketch(CAMERA, [at(x, 0.0, -0.1 * x)], plain).box_px[0] for x in (0.4, 0.8, 1.6)
+        render_sketch(CAMERA, [build_pose(x, 0.0, -0.1 * x)], plain_look).box_px[0]
+        for x in (0.4, 0.8, 1.6)
     ]
     widths = [box[2] - box[0] for box in boxes]
     np.testing.assert_allclose(widths, [widths[0], widths[0] / 2, widths[0] / 4], atol=2)
-    # The two rotors in front, 0.0325 m nearer, set the width.
+    # The two nearest rotors, 0.0325 m nearer than the centre, determine the width.
     near_m = 0.046 * np.cos(np.pi / 4)
     assert widths[0] == pytest.approx(2 * (near_m + 0.0235) * 183.73 / (0.4 - near_m), abs=1.5)
 
 
 @pytest.mark.heavy
-def test_the_box_holds_every_changed_pixel_and_no_more(plain: Look) -> None:
+def test_the_box_encloses_the_changed_pixels_tightly(plain_look: Look) -> None:
     rng = np.random.default_rng(1)
     for _ in range(20):
         (pose,) = random_poses(rng, CAMERA, 1)
-        sketch = render_sketch(CAMERA, [pose], plain)
-        changed = dark(sketch)
+        sketch = render_sketch(CAMERA, [pose], plain_look)
+        changed = find_changed_pixels(sketch)
         edges = np.concatenate([changed.min(axis=0) - 0.5, changed.max(axis=0) + 0.5])
         assert np.abs(sketch.box_px[0] - edges).max() <= 1
 
 
-def test_the_nearer_robot_hides_the_farther(plain: Look) -> None:
-    near, far = at(0.5, 0.0, 0.0), at(1.0, 0.05, 0.0)
+def test_the_nearer_robot_hides_the_farther(plain_look: Look) -> None:
+    near, far = build_pose(0.5, 0.0, 0.0), build_pose(1.0, 0.05, 0.0)
     one, other = (
-        render_sketch(CAMERA, [near, far], plain),
-        render_sketch(CAMERA, [far, near], plain),
+        render_sketch(CAMERA, [near, far], plain_look),
+        render_sketch(CAMERA, [far, near], plain_look),
     )
     np.testing.assert_array_equal(one.rgb, other.rgb)
     np.testing.assert_array_equal(one.visible_share, other.visible_share[::-1])
@@ -109,36 +116,36 @@ def test_the_nearer_robot_hides_the_farther(plain: Look) -> None:
     assert 0 < one.visible_share[1] < 0.8
 
 
-def test_box_is_clipped_at_the_image_edge(plain: Look) -> None:
-    sketch = render_sketch(CAMERA, [at(0.3, 0.27, 0.0)], plain)
+def test_box_is_clipped_at_the_image_edge(plain_look: Look) -> None:
+    sketch = render_sketch(CAMERA, [build_pose(0.3, 0.27, 0.0)], plain_look)
     assert sketch.box_px[0, 0] == 0.0
     assert sketch.box_px[0, 2] < 60
-    outside = render_sketch(CAMERA, [at(0.3, 2.0, 0.0)], plain)
+    outside = render_sketch(CAMERA, [build_pose(0.3, 2.0, 0.0)], plain_look)
     assert np.isnan(outside.box_px).all()
     assert outside.visible_share.tolist() == [0.0]
     assert (outside.rgb == 255).all()
 
 
-def test_invalid_sketch_scene_is_refused(plain: Look) -> None:
+def test_invalid_sketch_scene_is_refused(plain_look: Look) -> None:
     with pytest.raises(ValueError, match="behind the camera"):
-        render_sketch(CAMERA, [at(0.02, 0.0, 0.0)], plain)
+        render_sketch(CAMERA, [build_pose(0.02, 0.0, 0.0)], plain_look)
     with pytest.raises(ValueError, match="without distortion"):
-        render_sketch(AIDECK, [], plain)
+        render_sketch(AIDECK, [], plain_look)
 
 
-def test_faces_run_anticlockwise_seen_from_outside() -> None:
+def test_faces_are_anticlockwise_seen_from_outside() -> None:
     edge = np.diff(MESH.corners, axis=1)
     turned = np.cross(edge[:, 0], edge[:, 1])
     assert (np.einsum("fk,fk->f", turned, MESH.normals) > 0).all()
 
 
-def test_the_radius_holds_the_whole_quadrotor() -> None:
+def test_the_radius_encloses_the_whole_quadrotor() -> None:
     for corners in (MESH.corners, ROTOR_DISCS):
         assert np.linalg.norm(corners, axis=-1).max() <= RADIUS_M + 1e-9
 
 
 @pytest.mark.parametrize("opacity", [1.0, 0.5])
-def test_a_polygon_covers_its_area_in_its_place(opacity: float) -> None:
+def test_a_polygon_covers_its_area_at_its_position(opacity: float) -> None:
     rng = np.random.default_rng(0)
     excess, off = [], []
     for _ in range(50):
@@ -158,11 +165,12 @@ def test_a_polygon_covers_its_area_in_its_place(opacity: float) -> None:
         v, u = (np.indices(cover.shape) + 0.5).reshape(2, -1)
         middle = np.average([u, v], axis=1, weights=cover.ravel())
         off.append(middle - (at - (10, 20)))
-    assert 0 <= np.mean(excess) < 0.1  # pixels to every side
+    # A polygon grows by less than a tenth of a pixel on each side.
+    assert 0 <= np.mean(excess) < 0.1
     assert np.abs(np.mean(off, axis=0)).max() < 0.02 and np.abs(off).max() < 0.2
 
 
-def test_polygon_is_composited_over_the_background(plain: Look) -> None:
+def test_polygon_is_composited_over_the_background(plain_look: Look) -> None:
     ground = np.full((8, 8, 3), 64, np.uint8)
     canvas = Canvas(0, 0, 8, 8, ground=ground)
     corners = np.array([[[0, 0], [4, 0], [4, 8], [0, 8]]])
@@ -174,7 +182,7 @@ def test_polygon_is_composited_over_the_background(plain: Look) -> None:
 
 
 @pytest.mark.heavy
-def test_poses_fill_the_image_and_the_depths() -> None:
+def test_random_poses_fill_the_image_and_the_range_of_depths() -> None:
     rng = np.random.default_rng(0)
     xyz = np.array([p.xyz_camera for _ in range(400) for p in random_poses(rng, CAMERA, 3)])
     uv, depth_m = project(xyz, CAMERA.image_from_optical)
@@ -186,7 +194,7 @@ def test_poses_fill_the_image_and_the_depths() -> None:
 
 
 @pytest.mark.heavy
-def test_the_same_random_numbers_give_the_same_picture() -> None:
+def test_the_seed_decides_the_picture() -> None:
     def picture(seed: int) -> Sketch:
         rng = np.random.default_rng(seed)
         return render_sketch(CAMERA, random_poses(rng, CAMERA, 2), random_look(rng, CAMERA))
@@ -196,6 +204,6 @@ def test_the_same_random_numbers_give_the_same_picture() -> None:
 
 
 @pytest.mark.benchmark(group="sketch")
-def test_speed_of_a_picture(benchmark: BenchmarkFixture) -> None:
+def test_speed_of_a_sketch(benchmark: BenchmarkFixture) -> None:
     rng = np.random.default_rng(0)
     benchmark(lambda: render_sketch(CAMERA, random_poses(rng, CAMERA, 2), random_look(rng, CAMERA)))

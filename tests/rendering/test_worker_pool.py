@@ -1,4 +1,4 @@
-"""Workers behind pipes: protocol, order, and worker deaths."""
+"""Worker processes: their protocol, the order of results, and deaths of workers."""
 
 import sys
 from io import BytesIO
@@ -12,7 +12,7 @@ from dmrl.rendering import worker_pool
 from dmrl.rendering.blender import protocol
 from dmrl.rendering.worker_pool import Worker, WorkerPool, WorkerStart
 
-# Doubles numbers as a worker would; dies once of 5 and always of 13.
+# This worker doubles numbers. It dies at the first 5, and at every 13.
 FAKE = f"""
 import os, sys
 sys.path.insert(0, {str(Path(protocol.__file__).parent)!r})
@@ -39,7 +39,8 @@ while True:
 
 
 @pytest.fixture
-def start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> WorkerStart:
+def worker_start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> WorkerStart:
+    """Return the command and settings that start the fake worker."""
     script = tmp_path / "worker.py"
     script.write_text(FAKE)
     monkeypatch.setattr(worker_pool, "WORKER_SCRIPT", script)
@@ -47,6 +48,7 @@ def start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> WorkerStart:
 
 
 def double(worker: Worker, number: int) -> float:
+    """Let a worker double a number."""
     _, arrays = worker.request({"number": number}, {"in": np.array([float(number)])})
     return float(arrays["out"][0])
 
@@ -64,15 +66,15 @@ def test_worker_messages_round_trip() -> None:
 
 
 @pytest.mark.heavy
-def test_a_dead_worker_is_replaced_and_its_job_done_again(start: WorkerStart) -> None:
-    with WorkerPool(start, 2) as workers:
+def test_a_dead_worker_is_replaced_and_its_job_repeated(worker_start: WorkerStart) -> None:
+    with WorkerPool(worker_start, 2) as workers:
         assert list(workers.map(double, range(12))) == [2.0 * k for k in range(12)]
         assert workers.replaced == 1
 
 
 @pytest.mark.heavy
-def test_no_worker_outlives_a_pool_that_is_left_early(start: WorkerStart) -> None:
-    with pytest.raises(KeyError), WorkerPool(start, 4) as workers:
+def test_no_worker_outlives_a_pool_that_is_left_early(worker_start: WorkerStart) -> None:
+    with pytest.raises(KeyError), WorkerPool(worker_start, 4) as workers:
         for k, _ in enumerate(workers.map(double, range(100))):
             if k == 2:
                 started = workers.pids
@@ -82,19 +84,19 @@ def test_no_worker_outlives_a_pool_that_is_left_early(start: WorkerStart) -> Non
 
 
 @pytest.mark.heavy
-def test_a_job_that_kills_every_worker_is_an_error(start: WorkerStart) -> None:
-    with WorkerPool(start, 1) as workers, pytest.raises(BlenderError, match="died 3 times"):
+def test_a_job_that_kills_every_worker_is_an_error(worker_start: WorkerStart) -> None:
+    with WorkerPool(worker_start, 1) as workers, pytest.raises(BlenderError, match="died 3 times"):
         list(workers.map(double, [1, 13]))
 
 
 @pytest.mark.heavy
-def test_worker_error_about_a_model_is_raised(start: WorkerStart) -> None:
-    start.head["model"] = "bad"
+def test_worker_error_about_a_model_is_raised(worker_start: WorkerStart) -> None:
+    worker_start.head["model"] = "bad"
     with pytest.raises(BlenderError, match="bad is no model"):
-        WorkerPool(start, 1)
+        WorkerPool(worker_start, 1)
 
 
-def test_worker_that_fails_to_start_reports_the_reason(start: WorkerStart) -> None:
+def test_worker_that_fails_to_start_reports_the_reason(worker_start: WorkerStart) -> None:
     worker_pool.WORKER_SCRIPT.write_text("import nothing_of_that_name")
     with pytest.raises(BlenderError, match=r"nothing_of_that_name.*dmrl render --setup"):
-        WorkerPool(start, 1)
+        WorkerPool(worker_start, 1)

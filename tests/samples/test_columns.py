@@ -1,4 +1,4 @@
-"""Samples as columns are the same messages as one by one."""
+"""Columns of samples, compared with the same samples one by one."""
 
 from itertools import pairwise
 
@@ -32,14 +32,14 @@ LOGGED = {
     [Columns("/a", "PoseInFrame", TIMES_NS, POSE), Columns("/b", KIND, TIMES_NS, LOGGED)],
     ids=["nested", "logged"],
 )
-def test_they_are_the_same_bytes(columns: Columns) -> None:
+def test_columns_encode_to_the_bytes_of_single_samples(columns: Columns) -> None:
     kind = message_class(columns.message)
     rows = [kind(**sample.fields).SerializeToString() for sample in columns]
     data, at = encode(kind.DESCRIPTOR, columns.fields, len(TIMES_NS))
     assert rows == [data[a:b].tobytes() for a, b in pairwise(at)]
 
 
-def test_a_part_of_them_is_nested_too() -> None:
+def test_cropping_to_a_time_crops_nested_columns() -> None:
     part = Columns("/a", "PoseInFrame", TIMES_NS, POSE).crop_to_time(10, 30)
     assert part.time_ns.tolist() == [10, 20]
     assert [sample.fields["timestamp"]["seconds"] for sample in part] == [1, 2]
@@ -51,7 +51,7 @@ def test_an_event_without_variables_is_kept() -> None:
 
 
 @pytest.mark.parametrize("wrong", [np.nan, np.inf, -1e10])
-def test_times_that_are_no_seconds_are_named_by_row(wrong: float) -> None:
+def test_the_row_of_an_invalid_time_is_named(wrong: float) -> None:
     times = np.array([0.0, 1.5, wrong, np.nan])
     assert to_nanoseconds(times[:2]).tolist() == [0, 1_500_000_000]
     with pytest.raises(SourceError, match=r"a\.log: time (nan|inf|-1e\+10) s in row 2\."):

@@ -1,4 +1,4 @@
-"""The frames of /tf against geometry."""
+"""The frames of /tf, compared with the geometry of dmrl."""
 
 import numpy as np
 import pytest
@@ -9,8 +9,8 @@ from dmrl.samples.flight import RobotPose, build_transforms
 ANGLES = [(0.3, 0.2, 0.0), (-0.4, 0.1, 2.0), (0.2, -0.5, -1.0), (-0.3, -0.2, 3.0)]
 
 
-def turn(rotation: dict[str, float]) -> Array:
-    """(3, 3) parent from child, of a unit quaternion."""
+def build_matrix(rotation: dict[str, float]) -> Array:
+    """Return the matrix (3, 3) from child to parent of a unit quaternion."""
     x, y, z, w = (rotation[name] for name in "xyzw")
     assert x * x + y * y + z * z + w * w == pytest.approx(1)
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
@@ -18,7 +18,7 @@ def turn(rotation: dict[str, float]) -> Array:
 
 
 @pytest.mark.parametrize(("roll", "pitch", "yaw"), ANGLES)
-def test_frames_are_turned_as_geometry_turns_them(roll: float, pitch: float, yaw: float) -> None:
+def test_frames_have_the_rotations_of_the_geometry(roll: float, pitch: float, yaw: float) -> None:
     place = np.array([1.0, 2.0, 0.5])
     sample = build_transforms(3_000_000_007, {"cf1": RobotPose(place, yaw, roll, pitch)})
     world, camera, optical = sample.fields["transforms"]
@@ -27,9 +27,9 @@ def test_frames_are_turned_as_geometry_turns_them(roll: float, pitch: float, yaw
     assert world["translation"] == {"x": 1.0, "y": 2.0, "z": 0.5}
     c, s = np.cos(yaw), np.sin(yaw)
     np.testing.assert_allclose(
-        turn(world["rotation"]), [[c, -s, 0], [s, c, 0], [0, 0, 1]], atol=1e-12
+        build_matrix(world["rotation"]), [[c, -s, 0], [s, c, 0], [0, 0, 1]], atol=1e-12
     )
     np.testing.assert_allclose(
-        turn(camera["rotation"]), camera_from_horizontal(roll, pitch).T, atol=1e-12
+        build_matrix(camera["rotation"]), camera_from_horizontal(roll, pitch).T, atol=1e-12
     )
-    np.testing.assert_allclose(turn(optical["rotation"]), OPTICAL_FROM_CAMERA.T, atol=1e-12)
+    np.testing.assert_allclose(build_matrix(optical["rotation"]), OPTICAL_FROM_CAMERA.T, atol=1e-12)

@@ -1,4 +1,4 @@
-"""Panoramas behind the robots."""
+"""Views of panoramas that are backgrounds of robots."""
 
 from dataclasses import replace
 
@@ -11,7 +11,7 @@ from dmrl.rendering.backgrounds.panorama import Panorama, find_angles
 CAMERA = replace(AIDECK, distortion=())
 
 
-def test_angles_are_those_of_numpy() -> None:
+def test_angles_equal_those_of_numpy() -> None:
     rays = np.random.default_rng(0).standard_normal((3, 10_000))
     axes = [[0, 0, 0, 0, 1, -1], [0, 0, 1, -1, 0, 0], [1, -1, 0, 0, 0, 0]]
     rays = np.concatenate([rays / np.linalg.norm(rays, axis=0), axes], axis=1)
@@ -24,8 +24,8 @@ def test_angles_are_those_of_numpy() -> None:
 @pytest.mark.parametrize(
     ("turn_rad", "column", "row"),
     [
-        ((0.0, 0.0, 0.0), 0.5, 0.5),  # x forward is the middle of the panorama
-        ((0.0, 0.0, np.pi / 2), 0.25, 0.5),  # turned left by a quarter
+        ((0.0, 0.0, 0.0), 0.5, 0.5),  # forward, the middle of the panorama
+        ((0.0, 0.0, np.pi / 2), 0.25, 0.5),  # a quarter turn to the left
         ((0.0, np.pi / 4, 0.0), 0.5, 0.75),  # nose down
     ],
 )
@@ -41,9 +41,10 @@ def test_the_camera_sees_the_right_part_of_a_panorama(
 
 def test_a_view_interpolates_between_pixels_and_around_the_seam() -> None:
     light = np.random.default_rng(0).random((8, 16, 3)).astype(np.float32)
-    camera = replace(CAMERA, width_px=1, height_px=1, cx_px=0.5, cy_px=0.5)  # along x alone
+    # The only pixel of this camera looks along x.
+    camera = replace(CAMERA, width_px=1, height_px=1, cx_px=0.5, cy_px=0.5)
     for columns in range(-1, 15):
-        # Column c, counted from the seam, is seen at a turn of pi - 2 pi (c + 0.5) / 16.
+        # The middle of column c, counted from the seam, is at a turn of pi - 2 pi (c + 0.5) / 16.
         turn_rad = np.pi - 2 * np.pi * (columns + 1.0) / 16
         seen = Panorama(light).render(camera, (0.0, 0.0, turn_rad))[0, 0]
         around = light[3:5, [columns % 16, (columns + 1) % 16]]

@@ -1,4 +1,4 @@
-"""Photos behind the robots."""
+"""Photos that are backgrounds of robots."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -20,7 +20,7 @@ CAMERA = replace(AIDECK, distortion=())
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """One whole photo, one cut short, one that is none, and a text."""
+    """Return a folder of a whole photo, a truncated one, a file that is no photo, and a text."""
     photo = np.random.default_rng(0).integers(0, 255, (300, 400, 3), np.uint8)
     data = encode_jpeg(photo)
     (tmp_path / "a.jpg").write_bytes(data[: len(data) // 2])
@@ -49,7 +49,7 @@ def test_photo_is_area_averaged_or_point_sampled(tmp_path: Path) -> None:
         levels.append(
             np.unique(np.round(np.interp(light[:, 8:-8], SRGB_TO_LINEAR, np.arange(256))))
         )
-    # A pixel is two columns wide: every other one holds a stripe.
+    # A pixel is two columns wide, and every other pixel has a stripe.
     assert levels[1].tolist() == [0, 252]
     assert levels[0].min() > 0
 

@@ -1,4 +1,4 @@
-"""Generated rooms: perspective, order, and the table of items."""
+"""Generated rooms: perspective, occlusion, and the table of items."""
 
 import numpy as np
 import pytest
@@ -12,8 +12,8 @@ GREY, DARK, WHITE = np.full(3, 0.5), np.full(3, 0.1), np.full(3, 0.9)
 LOW, HIGH = np.array([-3.0, -3.0, 0.0]), np.array([5.0, 3.0, 3.0])
 
 
-def level_view(bend: float = 1e-3) -> RoomView:
-    """A level camera 1 m above the floor that looks ahead, without lamps."""
+def build_level_view(bend: float = 1e-3) -> RoomView:
+    """Return a view of 200 x 140 px from a level camera, 1 m above the floor, without lamps."""
     size = (200, 140)
     rng = np.random.default_rng(0)
     return RoomView(rng, size, 100.0, bend, 1.0, build_turn(0, 0, 0), np.zeros((0, 3)), 1.0)
@@ -22,27 +22,29 @@ def level_view(bend: float = 1e-3) -> RoomView:
 def paint(
     view: RoomView, *, wall: Surface | None = None, floor: Surface | None = None
 ) -> np.ndarray:
+    """Return the picture (140, 200, 3) of a room, grey where no surface is given."""
     plain = Surface(GREY, GREY, grain=0.0)
     surfaces = [wall or plain] * 4 + [floor or plain, plain]
     return view.paint(LOW, HIGH, surfaces).to_rgb()
 
 
 def test_a_box_stands_where_the_camera_projects_it() -> None:
-    view = level_view()
+    view = build_level_view()
     view.start_item(2.0)
     view.draw_box((2.0, 0.5, 0.0), (0.2, 0.4, 0.6), 0.0, DARK)
     rows, columns = np.nonzero(paint(view).mean(axis=2) < 0.3)
-    near = 100 / 1.9  # pixels a metre at the front
+    near = 100 / 1.9  # pixels a metre at the front of the box
     assert columns.mean() + 0.5 == pytest.approx(100 - 0.5 * near, abs=2)
     assert np.ptp(columns) + 1 == pytest.approx(0.4 * near, abs=3)
     assert rows.max() + 1 == pytest.approx(70 + near, abs=2)
-    assert rows.min() == pytest.approx(70 + 0.4 * 100 / 2.1, abs=2)  # the far edge of its top
+    # The highest row is at the far edge of the top.
+    assert rows.min() == pytest.approx(70 + 0.4 * 100 / 2.1, abs=2)
 
 
 def test_near_items_hide_far_ones_in_any_order() -> None:
     pictures = []
     for order in ((1.5, 3.0), (3.0, 1.5)):
-        view = level_view()
+        view = build_level_view()
         for far in order:
             view.start_item(far)
             view.draw_box((far, 0.0, 0.0), (0.1, 0.5, 1.5), 0.0, DARK if far < 2 else WHITE)
@@ -53,7 +55,7 @@ def test_near_items_hide_far_ones_in_any_order() -> None:
 
 def test_tiles_get_smaller_with_distance() -> None:
     floor = Surface(WHITE, DARK, "tiles", (0.5, 0.5), joint=0.06, grain=0.0)
-    picture = paint(level_view(), floor=floor).mean(axis=2)
+    picture = paint(build_level_view(), floor=floor).mean(axis=2)
     wide = []
     for row in (100, 135):  # 3.3 and 1.5 m away
         dark = np.flatnonzero(np.diff((picture[row] < 0.6).astype(int)) > 0)
@@ -62,9 +64,9 @@ def test_tiles_get_smaller_with_distance() -> None:
 
 
 def test_lens_distortion_applies_to_walls_and_items() -> None:
-    view = level_view(bend=0.1)
+    view = build_level_view(bend=0.1)
     uv, depth = view.project(np.array([[2.0, 1.5, 1.0]]))
-    straight, _ = level_view().project(np.array([[2.0, 1.5, 1.0]]))
+    straight, _ = build_level_view().project(np.array([[2.0, 1.5, 1.0]]))
     assert depth[0] == 2.0
     assert straight[0, 0] < uv[0, 0] < 100
     rays = [ray.reshape(140, 200) for ray in view._pixel_rays()]
@@ -75,7 +77,7 @@ def test_lens_distortion_applies_to_walls_and_items() -> None:
 @pytest.mark.parametrize("where", ["wall", "flat", "standing", "small"])
 @pytest.mark.heavy
 def test_every_item_of_the_table_can_be_drawn(where: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    bare = paint(level_view())
+    bare = paint(build_level_view())
     for item in list_items(where):
         monkeypatch.setattr(
             room_items,
@@ -84,7 +86,7 @@ def test_every_item_of_the_table_can_be_drawn(where: str, monkeypatch: pytest.Mo
         )
         seen = 0
         for seed in range(4):
-            view = level_view()
+            view = build_level_view()
             view.rng = np.random.default_rng(seed)
             draw_item(view, where, np.array([2.0, 0.0, 0.0]), 0.5)
             seen += (paint(view) != bare).any()
@@ -92,7 +94,7 @@ def test_every_item_of_the_table_can_be_drawn(where: str, monkeypatch: pytest.Mo
 
 
 @pytest.mark.heavy
-def test_a_room_is_the_same_by_number_and_has_both_ends_of_the_scale() -> None:
+def test_the_number_decides_a_room_and_rooms_have_dark_and_bright_pixels() -> None:
     assert (draw_numbered_room(5) == draw_numbered_room(5)).all()
     assert (draw_numbered_room(5) != draw_numbered_room(6)).any()
     rooms = np.stack([draw_numbered_room(k) for k in range(12)]).mean(axis=-1)

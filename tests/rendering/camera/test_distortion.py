@@ -15,7 +15,7 @@ from dmrl.rendering.camera.distortion import (
 )
 
 
-def test_undistorting_takes_distortion_back() -> None:
+def test_undistorting_inverts_distortion() -> None:
     uv = np.random.default_rng(0).uniform((0, 0), (320, 224), (200, 2))
     assert np.allclose(image_from_pinhole(pinhole_from_image(uv, AIDECK), AIDECK), uv, atol=1e-6)
 
@@ -29,7 +29,7 @@ def test_distortion_follows_the_plumb_bob_model_on_the_axis() -> None:
     )
 
 
-def test_a_picture_sampled_at_its_pixels_centres_is_itself() -> None:
+def test_sampling_at_pixel_centres_gives_the_picture() -> None:
     picture = np.random.default_rng(0).random((5, 7, 4), np.float32)
     v, u = np.mgrid[:5, :7] + 0.5
     places = np.stack([u, v], axis=-1).astype(np.float32)
@@ -37,7 +37,7 @@ def test_a_picture_sampled_at_its_pixels_centres_is_itself() -> None:
     assert np.allclose(sample_bilinear(picture, places - 100), 0)
 
 
-def test_the_canvas_holds_all_that_the_image_shows() -> None:
+def test_the_canvas_covers_all_pixels_of_the_image() -> None:
     canvas = pinhole_canvas(AIDECK)
     assert canvas.places_px is not None
     assert canvas.places_px.min() > 0

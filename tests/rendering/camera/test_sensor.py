@@ -1,4 +1,4 @@
-"""The simulated sensor."""
+"""The simulated sensor: mosaic, blur, exposure, vignetting and noise."""
 
 import numpy as np
 import pytest
@@ -13,7 +13,8 @@ from dmrl.rendering.camera.sensor import (
 )
 
 
-def rng() -> np.random.Generator:
+def make_rng() -> np.random.Generator:
+    """Return a new generator that always starts from the same seed."""
     return np.random.default_rng(0)
 
 
@@ -23,7 +24,7 @@ def test_demosaicing_restores_uniform_colour() -> None:
 
 
 def test_mosaic_keeps_measured_pixel_values() -> None:
-    picture = rng().random((8, 10, 3), np.float32)
+    picture = make_rng().random((8, 10, 3), np.float32)
     back = demosaic(to_bayer(picture))
     assert np.array_equal(back[::2, ::2, 0], picture[::2, ::2, 0])
     assert np.array_equal(back[1::2, 1::2, 2], picture[1::2, 1::2, 2])
@@ -41,33 +42,33 @@ def test_lens_blur_keeps_brightness_and_centroid() -> None:
     assert spread == pytest.approx(1.5, rel=0.05)
 
 
-def test_exposure_aims_at_the_brightness() -> None:
+def test_exposure_gives_the_configured_mean_brightness() -> None:
     light = np.full((20, 20, 3), 7.0, np.float32)
-    rgb = expose(light, Sensor(brightness=0.4), rng())
+    rgb = expose(light, Sensor(brightness=0.4), make_rng())
     assert rgb.dtype == np.uint8
     assert np.abs(rgb.astype(int) - 102).max() <= 1
 
 
 def test_corners_are_darker_under_vignetting() -> None:
     light = np.ones((20, 20, 3), np.float32)
-    rgb = expose(light, Sensor(brightness=0.5, contrast_gamma=1.0, vignetting=0.8), rng())
+    rgb = expose(light, Sensor(brightness=0.5, contrast_gamma=1.0, vignetting=0.8), make_rng())
     assert rgb[0, 0, 1] < 0.4 * rgb[10, 10, 1]
 
 
 def test_noise_has_the_configured_std() -> None:
     light = np.ones((200, 200, 3), np.float32)
     sensor = Sensor(brightness=0.5, contrast_gamma=1.0, shot_noise=0.002, read_noise=0.01)
-    rgb = expose(light, sensor, rng()) / 255
+    rgb = expose(light, sensor, make_rng()) / 255
     assert rgb.std() == pytest.approx((0.002 * 0.5 + 0.01**2) ** 0.5, rel=0.05)
 
 
-def test_the_same_noise_comes_from_the_same_seed() -> None:
-    light = rng().random((20, 20, 3), np.float32)
+def test_the_same_seed_gives_the_same_noise() -> None:
+    light = make_rng().random((20, 20, 3), np.float32)
     sensor = Sensor(bayer=True, shot_noise=0.01, saturation=0.5)
-    assert np.array_equal(expose(light, sensor, rng()), expose(light, sensor, rng()))
+    assert np.array_equal(expose(light, sensor, make_rng()), expose(light, sensor, make_rng()))
 
 
-def test_a_grey_camera_has_one_value_a_pixel() -> None:
+def test_without_saturation_the_three_channels_are_equal() -> None:
     light = np.random.default_rng(0).random((16, 24, 3), np.float32)
     sensor = Sensor(saturation=0.0, shot_noise=0.01, read_noise=0.02)
     rgb = expose(light, sensor, np.random.default_rng(1))
@@ -77,15 +78,15 @@ def test_a_grey_camera_has_one_value_a_pixel() -> None:
 
 @pytest.mark.parametrize("gamma", [0.5, 1.0, 1.2, 2.2, 3.0])
 def test_levels_are_powers_of_the_light(gamma: float) -> None:
-    light = rng().random((100, 200, 3)).astype(np.float32) ** 3
+    light = make_rng().random((100, 200, 3)).astype(np.float32) ** 3
     light[0, :2] = [[0, 0, 0], [1, 1, 1]]
-    rgb = expose(light, Sensor(brightness=None, contrast_gamma=gamma), rng())
+    rgb = expose(light, Sensor(brightness=None, contrast_gamma=gamma), make_rng())
     exact = 255 * light.astype(float) ** (1 / gamma)
     assert np.abs(rgb - exact).max() < 0.5 + 1e-4
     assert rgb[0, :2].tolist() == [[0, 0, 0], [255, 255, 255]]
 
 
-def test_no_bin_of_values_has_two_levels_limits() -> None:
+def test_every_bin_of_light_has_at_most_one_threshold() -> None:
     for gamma in np.linspace(0.5, 3, 101):
         _, thresholds = _tabulate_levels(float(gamma))
         assert np.isfinite(thresholds).sum() == 255

@@ -5,7 +5,7 @@ import numpy as np
 from dmrl.rendering.robots.crazyflie import CRAZYFLIE, outline_points
 
 
-def test_it_is_life_size_about_the_middle_of_its_box() -> None:
+def test_the_mesh_has_the_size_of_a_crazyflie_and_is_centred() -> None:
     points = CRAZYFLIE.build_mesh().vertices
     assert np.allclose(points.min(axis=0), -points.max(axis=0), atol=1e-3)
     assert np.isclose(np.ptp(points[:, 2]), 0.029)
@@ -17,7 +17,7 @@ def test_it_is_life_size_about_the_middle_of_its_box() -> None:
     assert np.isclose((radius.max() + radius.min()) / 2, 0.046, atol=2e-4)
 
 
-def test_every_part_has_a_surface_and_every_face_an_area() -> None:
+def test_every_material_has_faces_and_every_face_an_area() -> None:
     whole = CRAZYFLIE.build_mesh()
     assert set(whole.material.tolist()) == set(range(len(CRAZYFLIE.materials)))
     a, b, c = np.moveaxis(whole.vertices[whole.faces], 1, 0)
@@ -33,10 +33,10 @@ def test_solid_parts_are_closed_and_face_outwards() -> None:
     assert volume_m3 > 1e-6
 
 
-def test_whirling_blades_reach_as_far_as_their_discs() -> None:
+def test_the_outline_of_turning_blades_reaches_the_rotor_discs() -> None:
     whole = CRAZYFLIE.build_mesh().vertices
     whirling = outline_points(1.0, 0.3, 10.0)
     assert np.allclose(whirling.max(axis=0), whole.max(axis=0), atol=5e-4)
-    # Standing still, no blade points along x: the robot is narrower.
+    # At rest no blade points along x, so the robot is narrower.
     assert outline_points(1.0, 0.3, 0.0)[:, 0].max() < whole[:, 0].max()
     assert np.allclose(outline_points(2.0, 0.3, 10.0), 2 * whirling)

@@ -31,7 +31,7 @@ def test_feet_are_below_and_blades_above_the_board() -> None:
     assert height["frame"][-1] < height["motor"][-1] < height["blade"][-1]
 
 
-def test_blades_are_opposite_each_other_and_pitched_the_way_they_turn() -> None:
+def test_blades_are_pitched_in_the_direction_in_which_they_turn() -> None:
     mesh = VIOLET.build_mesh()
     faces = mesh.faces[mesh.material == VIOLET.materials.index("blade")]
     a, b, c = np.moveaxis(mesh.vertices[faces], 1, 0)
@@ -40,13 +40,13 @@ def test_blades_are_opposite_each_other_and_pitched_the_way_they_turn() -> None:
     out = middle[:, :2] - hub
     blade = (np.hypot(*out.T) > 0.004) & (np.abs(normal[:, 2]) > 1e-9)
     slope = normal[blade, :2] / normal[blade, 2:]
-    # A blade rises against the way its rotor turns; neighbours turn the other way.
+    # A blade rises against the rotation of its rotor, and neighbours turn in opposite directions.
     ways = np.sign(out[blade, 0] * slope[:, 1] - out[blade, 1] * slope[:, 0])
     clockwise = np.sign(np.prod(middle[blade, :2], axis=1))
     assert set((ways * clockwise).tolist()) in ({1.0}, {-1.0})
 
 
-def test_every_design_is_a_setting_and_the_other_way_round() -> None:
+def test_designs_equal_the_choices_of_the_setting() -> None:
     named = get_args(get_type_hints(Settings)["design"])
     assert set(named) == set(DESIGNS)
     assert DESIGNS[Settings().design].materials[0] == "board"
