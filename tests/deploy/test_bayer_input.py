@@ -1,3 +1,5 @@
+"""Demosaicing of raw images into the input of a network."""
+
 import numpy as np
 import pytest
 

@@ -1,3 +1,5 @@
+"""Generated C code of networks, compared bit for bit with the integer reference."""
+
 import shutil
 import subprocess
 from dataclasses import replace

@@ -1,3 +1,5 @@
+"""Simulated robots: their paths, attitudes, measurements and clocks."""
+
 from dataclasses import replace
 
 import numpy as np

@@ -1,3 +1,5 @@
+"""Files of sensor constants, and their use in labelling."""
+
 from dataclasses import replace
 from pathlib import Path
 

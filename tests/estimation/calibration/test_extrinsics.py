@@ -1,3 +1,5 @@
+"""The mount and delay of a camera, calibrated from detections in simulated flights."""
+
 from dataclasses import replace
 
 import numpy as np

@@ -1,3 +1,5 @@
+"""The intrinsics of a camera, calibrated from exact corners and from rendered boards."""
+
 from collections.abc import Callable
 from typing import Any
 

@@ -1,3 +1,5 @@
+"""Tests of whether the measurements of a flight fit its solution."""
+
 from dataclasses import replace
 from functools import cache
 

@@ -1,3 +1,5 @@
+"""Mistakes of units, axes, signs and clocks in logs, found and corrected."""
+
 from dataclasses import replace
 
 import numpy as np

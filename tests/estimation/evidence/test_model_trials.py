@@ -1,3 +1,5 @@
+"""Trials of error models: their scores, and noise levels over time."""
+
 from dataclasses import replace
 from functools import cache
 from unittest.mock import Mock

@@ -1,3 +1,5 @@
+"""Error models added to a solution, such as scales, jumps and late ranges."""
+
 from dataclasses import replace
 from unittest.mock import Mock
 

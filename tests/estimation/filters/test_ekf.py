@@ -1,3 +1,5 @@
+"""The published extended Kalman filter, compared with the publication and with derivatives."""
+
 import numpy as np
 import pytest
 from filterpy.kalman import ExtendedKalmanFilter

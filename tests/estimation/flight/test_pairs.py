@@ -1,3 +1,5 @@
+"""Positions of peers with statuses and covariances, from batch solves of simulated flights."""
+
 from dataclasses import replace
 from functools import cache
 

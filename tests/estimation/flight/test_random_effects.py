@@ -1,3 +1,5 @@
+"""Sensor constants pooled over flights, with their spread between flights."""
+
 from dataclasses import replace
 
 import numpy as np

@@ -1,3 +1,5 @@
+"""Measurements of a pair of robots, resampled to common times."""
+
 import numpy as np
 import pytest
 

@@ -1,3 +1,5 @@
+"""Metrics of estimated positions, compared with exact cases and direct computations."""
+
 from dataclasses import asdict, replace
 
 import numpy as np

@@ -1,3 +1,5 @@
+"""Statuses of positions: which are within the stated error, and which are ambiguous."""
+
 import numpy as np
 import pytest
 

@@ -1,3 +1,5 @@
+"""Offset and drift between clocks, estimated from ranges that two robots measured."""
+
 import numpy as np
 import pytest
 from hypothesis import Phase, given, settings

@@ -1,3 +1,5 @@
+"""Shifts between images, and the rates that follow from them."""
+
 import numpy as np
 import pytest
 

@@ -1,3 +1,5 @@
+"""Steps of a height sensor, such as those over a box, found and removed."""
+
 import numpy as np
 import pytest
 

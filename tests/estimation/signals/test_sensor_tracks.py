@@ -1,3 +1,5 @@
+"""Faults of logged signals: spikes, dropouts, frozen and saturated values."""
+
 import numpy as np
 import pytest
 

@@ -1,3 +1,5 @@
+"""The noise of detections, estimated from the residuals of a solve."""
+
 from dataclasses import replace
 from functools import cache
 

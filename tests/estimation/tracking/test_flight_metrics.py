@@ -1,3 +1,5 @@
+"""Metrics of peers in view, lost contacts and detection gaps of a flight."""
+
 import math
 from dataclasses import replace
 

@@ -1,3 +1,5 @@
+"""Tracks of peers from detections, compared with simulations of the tracker's own model."""
+
 from dataclasses import replace
 from unittest.mock import Mock
 

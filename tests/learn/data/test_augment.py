@@ -1,3 +1,5 @@
+"""Augmented images and labels, measured on bright squares."""
+
 import math
 from dataclasses import fields, replace
 

@@ -1,3 +1,5 @@
+"""Batches of images: their order, shuffling, shares and masks."""
+
 from collections.abc import Iterator
 
 import numpy as np

@@ -1,3 +1,5 @@
+"""Targets of the cells of a grid, from labels and from a teacher."""
+
 import numpy as np
 import pytest
 import torch

@@ -1,3 +1,5 @@
+"""Calibration of confidences to the share of right detections."""
+
 from dataclasses import replace
 
 import numpy as np

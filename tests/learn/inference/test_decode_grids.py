@@ -1,3 +1,5 @@
+"""Detections decoded from the grids of a network."""
+
 import numpy as np
 import pytest
 from hypothesis import given

@@ -1,3 +1,5 @@
+"""Metrics of detections, compared with cases computed by hand."""
+
 import math
 import time
 

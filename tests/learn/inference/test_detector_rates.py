@@ -1,3 +1,5 @@
+"""Rates of detections and false detections, measured for the tracker."""
+
 import json
 from pathlib import Path
 

@@ -1,3 +1,5 @@
+"""Models saved and loaded, and files that are refused."""
+
 import json
 import pickle
 from pathlib import Path

@@ -1,3 +1,5 @@
+"""Detections matched with labels, compared with exhaustive search."""
+
 from itertools import permutations
 
 import numpy as np

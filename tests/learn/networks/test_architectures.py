@@ -1,3 +1,5 @@
+"""Architectures of networks: their sizes, layers and initial weights."""
+
 import math
 
 import pytest

@@ -1,3 +1,5 @@
+"""The depthwise convolution, compared with that of torch."""
+
 import pytest
 import torch
 from torch import nn

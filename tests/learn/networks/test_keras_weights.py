@@ -1,3 +1,5 @@
+"""Published Keras weights, loaded and compared with a network in NumPy."""
+
 from pathlib import Path
 
 import h5py

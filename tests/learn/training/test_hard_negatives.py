@@ -1,3 +1,5 @@
+"""Images without robots, sampled by the confidence of the network."""
+
 import numpy as np
 import pytest
 import torch

@@ -1,3 +1,5 @@
+"""Loss terms, compared with the publication and with cases computed by hand."""
+
 import math
 from dataclasses import asdict, fields, replace
 

@@ -1,3 +1,5 @@
+"""The optimizers Muon and Adam, compared with their publications."""
+
 import numpy as np
 import pytest
 import torch

@@ -1,3 +1,5 @@
+"""TensorBoard logs on a full disk."""
+
 import errno
 import os
 import time

@@ -1,3 +1,5 @@
+"""Trainings: what they learn, log and refuse."""
+
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,3 +1,5 @@
+"""The confidence threshold, false alarms and validation metrics."""
+
 import numpy as np
 import pytest
 
