@@ -98,6 +98,7 @@ def compare(data: Path) -> tuple[dict[tuple[str, str, str], Agreement], list[plo
 
 
 def _maps(outputs: Outputs) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
+    """Return confidence and depth (rows, columns) of the first image."""
     grids = to_grids(outputs)
     return grids.confidence[0], grids.depth_m[0]
 

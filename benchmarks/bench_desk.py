@@ -74,11 +74,13 @@ def plant(pictures: Path, count: int, seed: int) -> dict[str, Moved]:
 
 
 def _read_labels(pictures: Path) -> list[Row]:
+    """Return the rows of the label table in a folder of pictures."""
     with (pictures / "labels.csv").open(newline="", encoding="utf-8") as stream:
         return list(csv.DictReader(stream))
 
 
 def _write_labels(out: Path, rows: list[Row]) -> None:
+    """Write rows as a label table."""
     with out.open("w", newline="", encoding="utf-8") as stream:
         writer = csv.DictWriter(stream, rows[0].keys())
         writer.writeheader()
@@ -118,6 +120,7 @@ def main() -> None:
 
 
 def _parse_arguments() -> argparse.Namespace:
+    """Parse the command line."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("out", type=Path)
     numbers = {"images": 1000, "planted": 50, "first": 60, "seed": 1, "views": 1}
@@ -207,6 +210,7 @@ def measure_network(model: Path, out: Path) -> float:
 
 
 def _read_precision(seen: Path, against: str = "truth") -> float:
+    """Return the average precision within 16 px of a recording's detections."""
     found = dmrl.evaluate(seen, against=against)
     return round(float(found["overall"]["ap_16_px"]["value"]), 4)
 

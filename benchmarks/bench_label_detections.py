@@ -88,6 +88,7 @@ def simulate_detections(flight: Flight, wrong: float, seed: int) -> dict[str, Ob
 
 
 def _detect(flight: Flight, robot: str, wrong: float, rng: np.random.Generator) -> ObserverLog:
+    """Simulate detections of all peers by a robot, with misses and false detections."""
     log, truth, clock = flight.robots[robot], flight.truth[robot], flight.clocks[robot]
     time_s = np.arange(log.time_s[0] + 0.05, log.time_s[-1], 1 / IMAGES_HZ)
     true_s = clock.to_true_time(time_s)
@@ -136,6 +137,7 @@ def solve_with(pairs: dict[Names, Pair], seen: dict[str, ObserverLog]) -> dict[N
 
 
 def _solve_both(pairs: dict[Names, Pair]) -> dict[Names, Estimate]:
+    """Return the estimates of pairs in both directions."""
     out: dict[Names, Estimate] = {}
     for (one, other), (here, there) in zip(
         pairs, estimate_pairs(list(pairs.values())), strict=True
@@ -207,6 +209,7 @@ def measure_case(name: str, noise: str, seeds: range) -> Iterator[Row]:
 def _evaluate(
     flight: Flight, pairs: dict[Names, Pair], found: dict[Names, Estimate]
 ) -> Iterator[EvaluatedPositions]:
+    """Compare the positions that the first robot estimates with the truth."""
     for (robot, peer), pair in pairs.items():
         if robot != "cf1":
             continue
@@ -219,6 +222,7 @@ def _evaluate(
 
 
 def _row(case: str, way: str, flown: list[list[EvaluatedPositions]], cpu_s: float) -> Row:
+    """Build a row of the table from the positions of all flights."""
     every = [judged for here in flown for judged in here]
     late = [judged.time_s >= SETTLE_S for judged in every]
     rmse = [
@@ -243,6 +247,7 @@ def _row(case: str, way: str, flown: list[list[EvaluatedPositions]], cpu_s: floa
 
 
 def _mean(values: Array) -> float:
+    """Return the mean, or 0 for no values."""
     return float(values.mean()) if len(values) else 0.0
 
 

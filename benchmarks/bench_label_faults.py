@@ -63,6 +63,7 @@ def build_pair(flight: Flight, one: str, other: str) -> Pair:
 
 
 def _signals(flight: Flight, robot: str) -> RobotLog:
+    """Return the log of a robot without samples in which a sensor gave no value."""
     log = flight.robots[robot]
     columns = (
         np.stack([log.roll_rad, log.pitch_rad, log.yaw_rate_radps], axis=1),
@@ -87,6 +88,7 @@ def run_published_filter(pairs: list[Pair]) -> list[tuple[Found, Found]]:
 
 
 def _at(estimate: Estimate, pair: Pair) -> Found:
+    """Interpolate an estimate to the times of a pair's log."""
     xy, spread, status = estimate.interpolate_at(list_times(pair))
     return xy, spread, status == OK
 
@@ -103,6 +105,7 @@ def solve_graph(pairs: list[Pair]) -> list[tuple[Found, Found]]:
 
 
 def _interpolate_graph(pair: Pair, key_s: Array, state: Array, covariance: Array) -> Found:
+    """Interpolate a state of a factor graph to the times of a pair's log."""
     status, time_s = classify_positions(state, covariance), list_times(pair)
     at = np.clip(np.searchsorted(key_s, time_s), 0, len(key_s) - 1)
     xy = np.stack([np.interp(time_s, key_s, axis) for axis in state[:, :2].T], axis=1)
@@ -215,6 +218,7 @@ def _row(
     flown: list[list[tuple[EvaluatedPositions, Mask]]],
     cpu_s: float,
 ) -> Row:
+    """Build a row of the table from the positions of all flights."""
     ways = [way for both in flown for way in both]
     late = [j.time_s >= SETTLE_S for j, _ in ways]
     rmse = [_rms(j.error_norm_m[at]) for (j, _), at in zip(ways, late, strict=True)]
@@ -242,6 +246,7 @@ def _row(
 
 
 def _rms(size_m: Array) -> float:
+    """Return the root mean square, or NaN for no values."""
     return float(np.sqrt(np.mean(size_m**2))) if len(size_m) else np.nan
 
 

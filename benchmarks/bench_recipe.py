@@ -160,6 +160,7 @@ def main() -> None:
 
 
 def _format(row: dict[str, Any], figure: str) -> str:
+    """Format a figure with its standard deviation over runs, if it is known."""
     spread = row[f"{figure}_std"]
     return f"{row[figure]:.3f}" + ("" if math.isnan(spread) else f" +- {spread:.3f}")
 

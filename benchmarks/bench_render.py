@@ -40,11 +40,13 @@ M_PER_UNIT = 0.002  # of the published model, which the authors rendered at twic
 
 
 def _children_s() -> float:
+    """Return the CPU seconds of ended child processes."""
     used = resource.getrusage(resource.RUSAGE_CHILDREN)
     return used.ru_utime + used.ru_stime
 
 
 def _own_s() -> float:
+    """Return the CPU seconds of this process."""
     used = resource.getrusage(resource.RUSAGE_SELF)
     return used.ru_utime + used.ru_stime
 

@@ -58,6 +58,7 @@ def write(path: Path, minutes: float) -> int:
 
 
 def _copy(sink: RecordingWriter, stamped) -> None:  # noqa: ANN001
+    """Copy a message; write true positions once more as estimates with a covariance."""
     sink.write(stamped.time_ns, stamped.topic, stamped.message)
     names = topics.parse_topic(topics.TRUTH, stamped.topic)
     if names is not None:
@@ -68,6 +69,7 @@ def _copy(sink: RecordingWriter, stamped) -> None:  # noqa: ANN001
 
 
 def _with_estimates(labels):  # noqa: ANN001, ANN202
+    """Return labels with an estimated label beside each true one."""
     both = message_class("PeerLabels")()
     both.CopyFrom(labels)
     for label in labels.peers:
@@ -78,6 +80,7 @@ def _with_estimates(labels):  # noqa: ANN001, ANN202
 
 
 def _predict(sink: RecordingWriter, time_ns: int, robot: str, rng: np.random.Generator) -> None:
+    """Write ten random detections and a random grid."""
     cells = rng.random((2, ROWS, COLS), np.float32)
     found = [
         {"u_px": u, "v_px": v, "depth_m": 1.0, "confidence": c}

@@ -75,6 +75,7 @@ def measure_first_image(path: Path, layout: str, *, kept: Path | None) -> dict[s
 
 
 def _wait_for_image(running: subprocess.Popen[str], port: int) -> Rgb:
+    """Wait until the viewer shows an image; return its screenshot."""
     deadline = time.monotonic() + PATIENCE_S
     while time.monotonic() < deadline and running.poll() is None:
         try:
@@ -89,6 +90,7 @@ def _wait_for_image(running: subprocess.Popen[str], port: int) -> Rgb:
 
 
 def _cpu_s(pid: int) -> dict[str, float]:
+    """Return the CPU seconds of dmrl and of its viewer."""
     own = psutil.Process(pid)
     used = {"dmrl": own.cpu_times(), "viewer": own.children()[0].cpu_times()}
     return {name: times.user + times.system for name, times in used.items()}

@@ -63,10 +63,12 @@ def solve(pair: Pair) -> tuple[Solved, Solved]:
 
 
 def _own(k: int) -> int:
+    """Return the key of the robot's pose at a keyframe."""
     return 2 * k
 
 
 def _peer(k: int) -> int:
+    """Return the key of the peer's pose at a keyframe."""
     return 2 * k + 1
 
 

@@ -22,6 +22,7 @@ Z_FROM_Y_UP = Matrix(((1, 0, 0, 0), (0, 0, -1, 0), (0, 1, 0, 0), (0, 0, 0, 1)))
 
 
 def prepare(job):
+    """Open the model and configure the scene as published; return the scene."""
     bpy.ops.wm.open_mainfile(filepath=job["model"])
     scene = bpy.context.scene
     scene.render.engine = "CYCLES"
@@ -45,6 +46,7 @@ def prepare(job):
 
 
 def apply_lean_settings(cycles):
+    """Apply the faster settings of Cycles that dmrl uses."""
     cycles.pixel_filter_type = "BOX"
     cycles.max_bounces = cycles.diffuse_bounces = cycles.glossy_bounces = 2
     cycles.transparent_max_bounces = 8
@@ -54,6 +56,7 @@ def apply_lean_settings(cycles):
 
 
 def place_robots(scene, matrices):
+    """Return robots at their poses, copied from the first."""
     first = bpy.data.objects["crazyflie"]
     robots = [first]
     for _ in matrices[1:]:
@@ -77,6 +80,7 @@ def read_box(path):
 
 
 def main(job):
+    """Render every image of a job, and the box of each robot."""
     scene = prepare(job)
     nodes = scene.node_tree.nodes
     out = Path(job["folder"])

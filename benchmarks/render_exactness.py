@@ -144,6 +144,7 @@ def build_grey_panorama(name: str) -> Panorama:
 
 
 def _without_noise(sensor: Sensor) -> Sensor:
+    """Return a sensor without noise."""
     return replace(sensor, shot_noise=0.0, read_noise=0.0)
 
 

@@ -58,5 +58,6 @@ def _render(recipe: str, images: int) -> np.ndarray:
 
 
 def _own_s() -> float:
+    """Return the CPU seconds of this process."""
     used = resource.getrusage(resource.RUSAGE_SELF)
     return used.ru_utime + used.ru_stime

@@ -22,6 +22,7 @@ spent_s = 0.0
 
 
 def timed_render():
+    """Render, and add the CPU seconds to the total."""
     global spent_s
     begin = time.process_time()
     found = _render_passes()
@@ -30,6 +31,7 @@ def timed_render():
 
 
 def timed_send(*message):
+    """Send a message, and write a line of times."""
     _send(*message)
     with OUT.open("a") as out:
         out.write(f"{time.process_time():.6f} {spent_s:.6f}\n")

@@ -110,6 +110,7 @@ def judge_flight(
 
 
 def _interpolate(bounds: Mapping[str, Array], pair: tuple[str, str], path: PairPaths) -> Array:
+    """Interpolate the bound of a pair's covariance (N, 2, 2) to the times of its path."""
     name = "-".join(pair)
     time_s = (path.time_ns - START_NS) * 1e-9
     entries = bounds[name].reshape(-1, 4).T
@@ -119,6 +120,7 @@ def _interpolate(bounds: Mapping[str, Array], pair: tuple[str, str], path: PairP
 
 
 def _mahalanobis_squared(error: Array, covariance: Array) -> Array:
+    """Return (N,) squared Mahalanobis distances of errors (N, 2), infinite if singular."""
     (a, b), (_, d) = covariance.transpose(1, 2, 0)
     x, y = error.T
     determinant = a * d - b * b
@@ -228,4 +230,5 @@ def combine(
 
 
 def _divide(part: float, whole: float) -> float:
+    """Return a share, or NaN of nothing."""
     return part / whole if whole else float("nan")

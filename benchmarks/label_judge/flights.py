@@ -118,6 +118,7 @@ class Base:
 
 @cache
 def _fly(base: Base) -> tuple[Flight, dict[Pair, Array], dict[Pair, Array]]:
+    """Simulate a flight; return it with true positions and bounds of both pairs over time."""
     settings, noise = base.settings, NOISE[base.noise]
     scenario = Scenario(2, base.duration_s, settings.trajectory, settings.yaw_spread_rad)
     flight = simulate(scenario, noise, base.seed, base.faults)
@@ -170,6 +171,7 @@ def write(logs: Logs, base: Base, what: Mapping[str, Any], path: Path) -> None:
 
 
 def _write_log(sink: RecordingWriter, robot: str, columns: Mapping[str, Array]) -> None:
+    """Write attitude, velocity and height of a robot; integrate yaw where it is not logged."""
     time_s, rate = columns["time_s"], columns["yaw_rate_radps"]
     known = np.isfinite(rate)
     rate = np.interp(time_s, time_s[known], rate[known]) if known.any() else np.zeros(len(rate))
@@ -199,6 +201,7 @@ def _write_columns(
 
 
 def _write_detections(sink: RecordingWriter, robot: str, at_s: float, rows: Array) -> None:
+    """Write the detections (N, 4) of an image."""
     names = ("u_px", "v_px", "depth_m", "confidence")
     found = [dict(zip(names, row, strict=True)) for row in rows.tolist()]
     message = message_class("Detections")(threshold=0.3, detections=found)

@@ -30,6 +30,7 @@ def write_real(row: str, number: int, data: Path, path: Path) -> None:
 
 
 def _convert_tiers(source: Path, path: Path) -> None:
+    """Convert a source to a recording."""
     from dmrl.stages import convert  # noqa: PLC0415  # starts slowly
 
     convert.run(source, path, convert.Settings())

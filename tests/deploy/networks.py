@@ -86,6 +86,7 @@ def random_network(seed: int) -> IntegerNetwork:
 
 
 def _grow_some(net: _NetworkBuilder, rng: Rng) -> None:
+    """Append a random layer, or a residual block, to a network."""
     small = min(net.shape[1:]) < 8
     kind = rng.choice(["conv", "conv", "depthwise", "pool", "residual", "pointwise"])
     stride = 1 if small else int(rng.choice([1, 1, 2]))
@@ -114,6 +115,7 @@ def _grow_residual(net: _NetworkBuilder, rng: Rng, dilation: int) -> None:
 
 
 def _with_heads(net: _NetworkBuilder, rng: Rng) -> IntegerNetwork:
+    """Append the heads, with offsets in half of all cases; return the network."""
     offsets = bool(rng.random() < 0.5)
     net.conv(4 if offsets else 2, 1, signed=True)
     tensor, stride_px = len(net.tensors) - 1, 8

@@ -46,6 +46,7 @@ def find_quantisable(seed: int) -> IntegerNetwork:
 
 
 def draw_images(network: IntegerNetwork, count: int, seed: int = 0) -> NDArray[np.uint8]:
+    """Draw random images (N, H, W, C) of a network's input size."""
     shape = (count, network.height_px, network.width_px, network.channels)
     return np.random.default_rng(seed).integers(0, 256, shape, dtype=np.uint8)
 

@@ -51,6 +51,7 @@ def write_network(folder: Path, kind: str) -> IntegerNetwork:
 
 
 def find_compiler(name: str) -> tuple[str, ...]:
+    """Return the command of a compiler, or skip the test."""
     words = COMPILERS[name]
     if shutil.which(words[0]) is None:
         pytest.skip(f"no {words[0]}")

@@ -42,11 +42,13 @@ def find_splittable(seed: int) -> IntegerNetwork:
 
 
 def verify(network: IntegerNetwork, folder: Path, near_bytes: int) -> TargetResult:
+    """Generate C with two memories, and compare it with the reference on a target."""
     write_c(network, folder, [], near_bytes=near_bytes)
     return verify_target(network, folder, GUARDED, compute_expected(network, draw_images(network)))
 
 
 def draw_images(network: IntegerNetwork) -> list[np.ndarray]:
+    """Draw three random images of a network's input size."""
     shape = (3, network.height_px, network.width_px, network.channels)
     return list(np.random.default_rng(0).integers(0, 256, shape, dtype=np.uint8))
 

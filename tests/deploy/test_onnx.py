@@ -39,6 +39,7 @@ def test_int8_onnx_gives_the_levels_of_the_reference(seed: int) -> None:
 
 
 def require_same_levels(network: IntegerNetwork, images: np.ndarray) -> None:
+    """Assert that int8 ONNX and the reference give equal integer levels."""
     wanted = build_reference_backend(network).outputs(images)
     got = OnnxRun(int8_onnx(network), threads=1).outputs(images)
     for name, values in wanted.items():

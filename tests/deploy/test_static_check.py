@@ -26,6 +26,7 @@ def build_onnx(*nodes: object, sides: tuple[int, ...] = (4,), image: object = 22
 
 
 def build_node(kind: str, inputs: tuple[str, ...], output: str, **more: object) -> object:
+    """Return a node of an ONNX graph with one output."""
     return helper.make_node(kind, list(inputs), [output], **more)
 
 

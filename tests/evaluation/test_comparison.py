@@ -20,6 +20,7 @@ def build_evaluated(name: str, labels: Points, error_px: np.ndarray) -> Labelled
 
 
 def draw_labels(seed: int = 0) -> Points:
+    """Draw one label an image."""
     rng = np.random.default_rng(seed)
     u_px, v_px = rng.uniform(20, 200, (2, IMAGES))
     return Points(np.arange(IMAGES), u_px, v_px, rng.uniform(0.3, 2, IMAGES), np.ones(IMAGES))

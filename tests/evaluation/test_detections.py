@@ -23,11 +23,13 @@ Image = tuple[Sequence[Any], Sequence[Any], Sequence[str]]
 def build_label(
     u_px: float, v_px: float = 20.0, source: str = "truth", status: int = STATUS_OK
 ) -> Any:
+    """Return the label of a peer 1 m away."""
     fields = {"u_px": u_px, "v_px": v_px, "depth_m": 1.0, "source": source, "status": status}
     return message_class("PeerLabel")(**fields)
 
 
 def build_detection(u_px: float, confidence: float) -> Any:
+    """Return a detection 2 m away."""
     return {"u_px": u_px, "v_px": 20.0, "depth_m": 2.0, "confidence": confidence}
 
 

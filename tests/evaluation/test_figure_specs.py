@@ -12,6 +12,7 @@ GOOD = {"title": "Losses", "shows": "losses", "of": ["model"]}
 
 
 def list_faults(table: Any) -> str:
+    """Return the faults of a figure's table in one line."""
     return "; ".join(iter_faults({"figure": [table]}, OUTS))
 
 

@@ -20,6 +20,7 @@ class Judged:
 
 
 def build_trace(name: str, error_m: list[float]) -> Judged:
+    """Return a flight, a sample a second, with equal errors in all three axes."""
     time_s = np.arange(float(len(error_m)))
     errors = np.repeat(np.reshape(error_m, (-1, 1)), 3, axis=1).astype(float)
     return Judged(ErrorTrace(name, name, time_s, np.ones_like(errors), {"tracks": errors}))

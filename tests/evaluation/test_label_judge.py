@@ -12,6 +12,7 @@ from dmrl.recording import Provenance, RecordingWriter
 
 @pytest.fixture(autouse=True)
 def _judge(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Make the label judge of the benchmarks importable."""
     monkeypatch.syspath_prepend(str(Path(__file__).parents[2] / "benchmarks"))
 
 

@@ -52,6 +52,7 @@ def _write_flight(
 
 
 def _compute_limit(path: Path, settle_s: float = 10.0) -> Any:
+    """Return the limit that the evaluation of a flight states."""
     return document(path, judge(path), settle_s)["limit"]
 
 

@@ -15,6 +15,7 @@ LINK = ("cf1", "cf2")
 
 
 def _build_still_truth(place_m: tuple[float, float, float], time_s: Array) -> Truth:
+    """Return the true path of a robot that does not move."""
     none = np.zeros(len(time_s))
     place = np.tile(np.array(place_m), (len(time_s), 1))
     return Truth(time_s, place, np.zeros((len(time_s), 3)), none, none, none)

@@ -18,6 +18,7 @@ COLUMNS = [name for name in RobotLog.__slots__ if name != "time_s"]
 
 
 def simulate_with(*faults: Fault) -> Flight:
+    """Simulate a short flight with faults, always from the same seed."""
     return simulate(SHORT, NOISE["harsh"], 5, faults)
 
 

@@ -15,6 +15,7 @@ Places = list[tuple[float, float]]
 
 
 def build_track(x: float, y: float) -> PeerTrack:
+    """Return the track of a peer at rest, in metres ahead and to the left."""
     place = np.array([x, y, 0.0])
     return PeerTrack(1, "cf2", place, np.zeros(3), 0.0025 * np.eye(3), 0.1)
 

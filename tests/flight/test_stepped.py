@@ -16,6 +16,7 @@ EIGHT = Scenario(2, 60.0, "figure_of_eight", flown=1)
 
 
 def fly(command: Command, seconds: float, scenario: Scenario = EIGHT) -> SteppedFlight:
+    """Fly one command with ideal sensors for some seconds."""
     flight = SteppedFlight(scenario, NOISE["ideal"], 3)
     flight.advance({"cf1": command}, round(seconds * 100))
     return flight

@@ -25,6 +25,7 @@ EXACT = np.eye(3) * 1e-12
 def build_positions(
     *xyz_m: tuple[float, float, float], covariance: Array = EXACT, status: int = STATUS_OK
 ) -> PeerPositions:
+    """Return positions of a peer in metres, a nanosecond apart."""
     count = len(xyz_m)
     return PeerPositions(
         np.arange(count),
@@ -37,6 +38,7 @@ def build_positions(
 def build_labels(
     found: PeerPositions, look: CameraOptions = SHARP, camera: Camera = CAMERA, **tilt: float
 ) -> list[Any]:
+    """Label an image at each position, with roll and pitch in radians."""
     attitude = np.tile([tilt.get("roll", 0.0), tilt.get("pitch", 0.0)], (len(found.time_ns), 1))
     return list(label_images("cf2", found, attitude, camera, look))
 

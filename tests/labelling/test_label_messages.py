@@ -37,10 +37,12 @@ def build_log() -> RobotLog:
 
 
 def build_logs(flying: Sequence[str] = ("cf1", "cf2")) -> SensorLogs:
+    """Return the sensor logs of a flight in which only cf1 has a log."""
     return SensorLogs(START_NS, {"cf1": build_log()}, {}, frozenset(flying), [])
 
 
 def write_flight(path: Path, images_s: Sequence[float], labels: Sequence[Any] = ()) -> Path:
+    """Write a flight of cf1 with empty images at times in seconds, and labels."""
     with RecordingWriter(path, Provenance("test")) as sink:
         sink.write(START_NS, topics.HEIGHT("cf1"), message_class("Height")(height_m=1.0))
         for moment in images_s:
@@ -52,6 +54,7 @@ def write_flight(path: Path, images_s: Sequence[float], labels: Sequence[Any] = 
 
 
 def build_positions(time_s: Sequence[float], status: int = STATUS_OK) -> PeerPositions:
+    """Return positions of a peer that moves from right to left, 2 m ahead."""
     count = len(time_s)
     xyz_m = np.column_stack(
         [np.full(count, 2.0), np.linspace(-0.2, 0.2, count), np.full(count, 0.1)]
@@ -64,6 +67,7 @@ def build_positions(time_s: Sequence[float], status: int = STATUS_OK) -> PeerPos
 def build_labels(
     path: Path, found: dict[str, PeerPositions], camera: Camera, known: SensorLogs
 ) -> list[Any]:
+    """Return the label messages of cf1 with its camera."""
     look = CameraOptions(0.01, cameras={"cf1": camera})
     return list(build_label_messages(read_flight(path), known, "cf1", found, look))
 

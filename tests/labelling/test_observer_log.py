@@ -29,11 +29,13 @@ TURN_RADPS = 0.2
 def build_detection(
     u_px: float, confidence: float = 0.9, depth_m: float = 2.0, sigma_m: float = 0.1
 ) -> Any:
+    """Return the fields of a detection."""
     values = {"u_px": u_px, "v_px": u_px / 2, "depth_m": depth_m, "confidence": confidence}
     return {**values, "sigma_depth_m": sigma_m}
 
 
 def build_detections_row(time_s: float, *found_there: Any, threshold: float = 0.5) -> Row:
+    """Return a row of detections at a time in seconds."""
     fields = {"detections": list(found_there), "threshold": threshold}
     return time_s, topics.DETECTIONS("cf1"), "Detections", fields
 
@@ -53,6 +55,7 @@ def list_motion_rows(velocity: bool = True, height: bool = True) -> list[Row]:
 
 
 def write_recording(path: Path, rows: Sequence[Row]) -> Path:
+    """Write rows of time, topic, type and fields; return the path."""
     with RecordingWriter(path, Provenance("test")) as sink:
         for time_s, topic, kind, fields in rows:
             sink.write(round(time_s * SECOND_NS), topic, message_class(kind)(**fields))
@@ -62,6 +65,7 @@ def write_recording(path: Path, rows: Sequence[Row]) -> Path:
 def read_log(
     path: Path, rows: Sequence[Row], threshold: float | None = None, **camera: Any
 ) -> ObserverLog:
+    """Write rows and read them as the log of the observer cf1."""
     write_recording(path, rows)
     return read_observer_log(read_flight(path), "cf1", replace(AIDECK, **camera), threshold)
 

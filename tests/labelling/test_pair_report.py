@@ -31,6 +31,7 @@ def build_positions() -> PeerPositions:
 
 
 def build_estimate() -> Estimate:
+    """Return an estimate with known constants and two probable causes of errors."""
     constants = np.zeros(len(PAIR_LAYOUT.constants))
     for value, name, *own in ((0.35, "range_offset", 0, 1), (0.02, "gyro_bias", 0)):
         constants[PAIR_LAYOUT.find(name, *own)] = value
@@ -44,6 +45,7 @@ def build_estimate() -> Estimate:
 
 
 def write_truth(path: Path, truth_s: list[float]) -> Path:
+    """Write true positions whose x, in metres, is the time in seconds."""
     with RecordingWriter(path, Provenance("test")) as sink:
         for moment in truth_s:
             at = message_class("PeerPosition")(x=moment, y=0.0, z=1.0)
@@ -52,6 +54,7 @@ def write_truth(path: Path, truth_s: list[float]) -> Path:
 
 
 def build_report(path: Path) -> PairReport:
+    """Report the pair of cf1 and cf2 from its positions and estimate."""
     return report_pair(read_flight(path), ("cf1", "cf2"), build_positions(), build_estimate())
 
 

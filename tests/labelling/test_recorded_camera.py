@@ -19,6 +19,7 @@ from dmrl.recording import Provenance, RecordingWriter
 
 
 def write_flight(path: Path, **lens: Any) -> Path:
+    """Write a calibration and two images at 5 and 9 ns; return the path."""
     fields = {"width": 320, "height": 224, "K": [181, 0, 150, 0, 182, 100, 0, 0, 1], **lens}
     with RecordingWriter(path, Provenance("test")) as sink:
         sink.write(0, topics.CALIBRATION("cf1"), message_class("CameraCalibration")(**fields))

@@ -37,6 +37,7 @@ def write_flight(
 
 
 def write_ranges(write: Write, one: str = "cf1", other: str = "cf2", count: int = 40) -> None:
+    """Write ranges that grow, one every 0.15 s."""
     for k in range(count):
         write(
             0.1 + 0.15 * k,

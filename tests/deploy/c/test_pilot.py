@@ -34,11 +34,13 @@ DISTANCE_M = 0.7
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
+    """Return a folder with the C code of the pilot."""
     write_pilot(tmp_path, AIDECK_PINHOLE, CONSTANTS, DETECTIONS_MAX)
     return tmp_path
 
 
 def skip_without(*programs: str) -> pytest.MarkDecorator:
+    """Return a mark that skips where a program is missing."""
     absent = [name for name in programs if shutil.which(name) is None]
     return pytest.mark.skipif(bool(absent), reason=f"no {absent}")
 
@@ -54,6 +56,7 @@ class Pictures:
 
 
 def quantise_nano() -> IntegerNetwork:
+    """Return dmrl-nano quantised on sketched pictures."""
     model = load_model(resolve_model_path(Path("dmrl-nano")))
     return quantise_model(model, Pictures(), 16, grey=False).network
 

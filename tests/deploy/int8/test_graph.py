@@ -36,10 +36,12 @@ def build_settled_network(name: str) -> Network:
 
 
 def to_torch_input(images: np.ndarray) -> Tensor:
+    """Return images (N, H, W, 3) as normalised input of torch."""
     return networks.normalize_images(torch.from_numpy(images).permute(0, 3, 1, 2))
 
 
 def compute_outputs(graph: FloatGraph, images: np.ndarray) -> np.ndarray:
+    """Return the outputs of a graph for images (N, H, W, 3)."""
     return select_outputs(graph, compute_tensors(graph, normalize_images(images)))
 
 

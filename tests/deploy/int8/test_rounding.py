@@ -19,12 +19,14 @@ SMOOTH = np.cumsum(STEPS, axis=2).astype(np.uint8)
 
 
 def layer(groups: int) -> FloatConv:
+    """Return a random convolution of 3 x 3 pixels and three channels."""
     rng = np.random.default_rng(4)
     weight = rng.normal(0, 0.3, (3, 3 // groups, 3, 3))
     return FloatConv("conv", (0,), weight, rng.normal(0, 0.1, 3), padding=1, groups=groups)
 
 
 def compute_output(one: FloatConv) -> np.ndarray:
+    """Return the output of a convolution for the smooth images."""
     return compute_tensors(FloatGraph((one,), ()), normalize_images(SMOOTH))[1].astype(np.float64)
 
 

@@ -36,16 +36,19 @@ LENGTH_S = 30.0
 
 
 def simulate_pair() -> Pair:
+    """Simulate a pair that sees each other, with calibrated sensors."""
     return build_pair(simulate_flight("in_view", "calibrated", 1003, LENGTH_S))
 
 
 def solve(given: Pair) -> tuple[Solver, Values]:
+    """Solve a pair without error models; return the solver and its solution."""
     found = solve_pair(build_problem({(0, 1): given}), NoiseModel(), plain=True)
     return found.solver, found.values
 
 
 @cache
 def solve_sound() -> tuple[Solver, Values]:
+    """Solve the simulated pair, which has no fault."""
     return solve(simulate_pair())
 
 

@@ -40,6 +40,7 @@ def solve_plain(pair: Pair) -> Member:
 
 @cache
 def solve_sound() -> Member:
+    """Solve a simulated pair without faults."""
     return solve_plain(build_pair(simulate_flight("in_view", "calibrated", 1000, 20.0)))
 
 

@@ -86,6 +86,7 @@ def test_covariance_includes_distance_between_modes() -> None:
 
 
 def _hold_still(path: Odometry) -> Odometry:
+    """Return odometry of a robot that does not move."""
     return replace(path, heading_rad=0 * path.heading_rad, position_m=0 * path.position_m)
 
 

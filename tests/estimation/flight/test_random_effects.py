@@ -25,6 +25,7 @@ RANGE_BIAS = PAIR_LAYOUT.find("range_offset", 0, 1)
 
 
 def build_prior(found: Array) -> ConstantPrior:
+    """Return the prior of sensor constants at given values."""
     return ConstantPrior(found, USUAL, tuple(row.loss for row in ROWS))
 
 

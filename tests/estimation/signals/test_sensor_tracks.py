@@ -14,6 +14,7 @@ GRID_S = np.arange(0, 20, 0.01)
 
 
 def draw_noise() -> np.ndarray:
+    """Draw noise (N, 2) on the grid with a standard deviation of 0.1."""
     return np.random.default_rng(0).normal(0, 0.1, (len(GRID_S), 2))
 
 

@@ -39,6 +39,7 @@ def simulate_images(hz: float = 10.0) -> BearingMeasurements:
 
 @cache
 def solve_seen() -> tuple[Solver, MapEstimate]:
+    """Solve the simulated pair with its detections."""
     return solve_sighted(simulate_images())
 
 

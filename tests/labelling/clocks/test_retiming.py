@@ -16,6 +16,7 @@ IMAGE, POSE, TRUTH = topics.CAMERA_IMAGE("cf1"), topics.POSE("cf1"), topics.TRUE
 
 
 def build_transforms(child: str) -> Any:
+    """Return a message with the transform of one child frame."""
     return message_class("FrameTransforms")(transforms=[{"child_frame_id": child}])
 
 
@@ -39,10 +40,12 @@ def recording(tmp_path: Path) -> Path:
 
 
 def read_times(path: Path, topic: str) -> list[int]:
+    """Return the log times of a topic in ns."""
     return [raw.time_ns for raw in read_raw(path, topic)]
 
 
 def write_corrected(held: Corrected, out: Path) -> Path:
+    """Write a recording with corrected times; return its path."""
     with RecordingWriter(out, Provenance("test")) as sink:
         held.write(sink)
     return out
