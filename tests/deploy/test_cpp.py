@@ -75,7 +75,9 @@ def test_every_file_compiles_without_a_warning(name: str, kind: str, tmp_path: P
 @pytest.mark.heavy
 @pytest.mark.parametrize("kind", ["plain", "two memories"])
 @pytest.mark.parametrize("name", ["gcc", "g++", "clang++"])
-def test_a_cpp_program_links_it_and_detects_the_same(name: str, kind: str, tmp_path: Path) -> None:
+def test_a_cpp_program_links_the_c_and_finds_the_same_detections(
+    name: str, kind: str, tmp_path: Path
+) -> None:
     words = find_compiler(name)
     if shutil.which("g++") is None:
         pytest.skip("no g++")

@@ -47,7 +47,7 @@ def require_same_levels(network: IntegerNetwork, images: np.ndarray) -> None:
         np.testing.assert_array_equal(np.rint(got[name] / head.scale), np.rint(values / head.scale))
 
 
-def test_shortcuts_and_sums_are_among_these_networks() -> None:
+def test_random_networks_include_shortcuts_and_sums() -> None:
     layers = [layer for seed in SEEDS for layer in quantised_network(seed).layers]
     assert sum(isinstance(layer, Conv) and layer.shortcut >= 0 for layer in layers) > 3
     assert sum(isinstance(layer, Add) for layer in layers) > 1

@@ -27,7 +27,7 @@ def write_captured_flight(path: Path, lost: tuple[int, int] = (0, 0)) -> FlightL
     return read_flight(path)
 
 
-def test_a_peer_is_where_the_robot_sees_it(tmp_path: Path) -> None:
+def test_true_positions_of_a_peer_are_in_the_frame_of_the_robot(tmp_path: Path) -> None:
     held = write_captured_flight(tmp_path / "a.mcap")
     assert list_true_pairs(held.topics) == [("cf1", "cf2"), ("cf2", "cf1")]
     time_ns, xyz = find_true_path(held, "cf1", "cf2")

@@ -88,7 +88,7 @@ def test_detections_are_given_to_their_image(tmp_path: Path) -> None:
     assert (sight.view(2).depth_m.tolist(), sight.view(2).sigma_depth_m.tolist()) == ([3.0], [0.0])
 
 
-def test_a_threshold_that_is_given_counts_in_place_of_the_detectors(tmp_path: Path) -> None:
+def test_a_given_threshold_replaces_that_of_the_detector(tmp_path: Path) -> None:
     rows = [
         build_detections_row(1.0, build_detection(10, 0.45), build_detection(20, 0.3)),
         *list_motion_rows(),

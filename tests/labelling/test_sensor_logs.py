@@ -102,7 +102,9 @@ def test_heights_are_smoothed_over_half_a_second_without_bending_a_climb() -> No
         ({"pitch_rad": -0.7, "yaw_rate_radps": 5.0}, []),
     ],
 )
-def test_degrees_are_suspected(tmp_path: Path, change: dict[str, float], said: list[str]) -> None:
+def test_values_that_look_like_degrees_are_reported(
+    tmp_path: Path, change: dict[str, float], said: list[str]
+) -> None:
     def steep(write: Write) -> None:
         for time_s in np.arange(0, 8, 0.05).tolist():
             write(time_s, topics.ATTITUDE("cf1"), message_class("Attitude")(**change))
@@ -172,14 +174,14 @@ def test_sensor_with_only_nan_is_omitted(tmp_path: Path, kind: str) -> None:
     assert f"/cf2/{kind}: nothing to use; its pairs are left out" in found.warnings
 
 
-def test_enough_ranges_are_just_enough(tmp_path: Path) -> None:
+def test_the_minimum_number_of_ranges_makes_a_pair(tmp_path: Path) -> None:
     found = read_logs(
         tmp_path / "a.mcap", write_flight, lambda w: write_ranges(w, count=MIN_RANGES)
     )
     assert len(found.pairs["cf1", "cf2"].range_m) == MIN_RANGES
 
 
-def test_silence_is_a_gap_of_that_robot(tmp_path: Path) -> None:
+def test_silence_of_a_sensor_is_a_gap_of_its_robot_only(tmp_path: Path) -> None:
     def silent(write: Write) -> None:
         def loud(t: float, topic: str, m: Any) -> None:
             if not (3.0 < t < 5.0 and topic == "/cf2/attitude"):

@@ -115,7 +115,7 @@ def test_packets_are_read_as_they_were_written() -> None:
 
 @skip_without("clang")
 @pytest.mark.heavy
-def test_it_compiles_for_a_cortex_m4_without_a_library_and_has_its_stated_size(
+def test_pilot_compiles_for_a_cortex_m4_without_a_library_at_its_stated_size(
     folder: Path,
 ) -> None:
     size = f'#include "pilot.h"\nchar fits[sizeof(pilot_t) == {PILOT_BYTES} ? 1 : -1];\n'

@@ -24,7 +24,7 @@ from dmrl.estimation.solver.robust_loss import Gaussian
 from ..flights import build_pair, build_two_way_pair, compute_truth, simulate_flight
 
 
-def test_a_clock_moves_with_all_that_it_stamps() -> None:
+def test_a_shifted_clock_moves_all_of_its_measurements() -> None:
     pair = build_two_way_pair(simulate_flight("in_view", "calibrated", 1000, 20.0))
     moved = ClockShift(2.0).move(pair)
     at = slice(300, 1500)
@@ -39,7 +39,7 @@ def test_a_clock_moves_with_all_that_it_stamps() -> None:
         assert first - pair.range_time_s[pair.range_sender == robot][0] == pytest.approx(shift_s)
 
 
-def test_a_jump_moves_what_comes_after_it() -> None:
+def test_a_jump_of_a_clock_moves_only_later_measurements() -> None:
     pair = build_two_way_pair(simulate_flight("in_view", "calibrated", 1000, 20.0))
     moved = ClockShift(-0.4, 10.0).move(pair)
     assert moved.peer.vx_mps[:950] == pytest.approx(pair.peer.vx_mps[:950])
@@ -50,7 +50,7 @@ def test_a_jump_moves_what_comes_after_it() -> None:
 
 
 @pytest.mark.parametrize("shift", [ClockShift(0.3), ClockShift(-0.4, 10.0), ClockShift(0.4, 10.0)])
-def test_times_return_to_the_log(shift: ClockShift) -> None:
+def test_shifted_times_are_converted_back_to_log_times(shift: ClockShift) -> None:
     log_s = np.array([1.0, 9.0, 9.9, 12.0, 15.0])
     assert shift.to_log_times(log_s + shift.shift_s * (log_s >= shift.from_s))[[0, 1, 3, 4]] == (
         pytest.approx(log_s[[0, 1, 3, 4]])
@@ -93,7 +93,7 @@ def test_the_ranges_of_both_robots_show_an_offset_of_the_clock(shift_s: float) -
 
 
 @pytest.mark.heavy
-def test_a_clock_that_is_seconds_off_fits_when_it_is_moved() -> None:
+def test_a_clock_that_is_seconds_off_is_found() -> None:
     late = ClockShift(3.2).move(
         build_two_way_pair(simulate_flight("in_view", "calibrated", 1000, 60.0))
     )
@@ -104,7 +104,7 @@ def test_a_clock_that_is_seconds_off_fits_when_it_is_moved() -> None:
 
 @pytest.mark.heavy
 @pytest.mark.parametrize("shift_s", [-0.4, 0.5])
-def test_a_flight_whose_clock_jumps_is_solved_as_if_it_did_not(shift_s: float) -> None:
+def test_a_jump_of_a_clock_is_found_and_corrected(shift_s: float) -> None:
     flight = simulate_flight("in_view", "realistic", 1000, 100.0)
     sound = build_pair(flight)
     jumping = ClockShift(shift_s, 40.0).move(build_two_way_pair(flight))

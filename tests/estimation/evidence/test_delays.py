@@ -42,7 +42,7 @@ def test_gaps_of_a_late_yaw_rate_move_with_it() -> None:
 
 
 @pytest.mark.parametrize("unknown", list(SIGNALS))
-def test_one_signal_is_moved_and_no_other(unknown: str) -> None:
+def test_a_delay_moves_one_signal_only(unknown: str) -> None:
     pair = build_pair(simulate_flight("in_view", "calibrated", 1000, 20.0))
     moved = move_signal(pair, Delay(unknown, MODELS[unknown], 0.3))
     assert moved.own is pair.own

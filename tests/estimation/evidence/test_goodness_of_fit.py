@@ -102,7 +102,7 @@ def test_a_statistic_is_the_fall_of_the_cost_if_the_error_were_estimated() -> No
     assert statistic == pytest.approx(2 * fall, rel=0.05)
 
 
-def test_scores_are_those_of_the_optimum_where_a_solve_ended_before_it() -> None:
+def test_scores_are_extrapolated_to_the_optimum_of_an_early_ended_solve() -> None:
     solver, values = solve_sound()
     optimum = solver.solve(values, tolerance=1e-12).values
     before = Values(optimum.state.copy(), optimum.constants.copy())
@@ -139,7 +139,7 @@ def test_score_covariance_excludes_what_the_unknowns_explain() -> None:
     assert found.covariance == pytest.approx(expected, abs=1e-9)
 
 
-def test_directions_that_the_unknowns_explain_are_not_tested() -> None:
+def test_directions_explained_by_the_unknowns_are_not_tested() -> None:
     covariance = np.diag([1.0, 0.25, 0.0]).reshape(3, 1, 3, 1)
     one = SignalScores("flow", 0, np.arange(3.0), np.array([[2.0], [1.0], [5.0]]), covariance)
     square, freedom = one.chi_squares(2)
@@ -175,7 +175,7 @@ def test_no_position_of_a_stretch_that_does_not_fit_is_ok() -> None:
 
 
 @pytest.mark.parametrize(("precise", "kept"), [(9, 0), (10, 10)])
-def test_a_flight_of_which_little_is_precise_is_refused(precise: int, kept: int) -> None:
+def test_a_flight_with_few_precise_positions_is_refused(precise: int, kept: int) -> None:
     state = np.tile([2.0, 0.0, 0.0], (100, 1))
     spread = np.tile(np.diag([0.04, 0.04, 1e-4]), (100, 1, 1))
     spread[50 : 50 + precise] *= 0.01
@@ -189,7 +189,7 @@ def test_a_flight_of_which_little_is_precise_is_refused(precise: int, kept: int)
 @pytest.mark.parametrize(
     ("signal", "refused"), [("yaw rate", range(38, 53)), ("bearing", range(10, 81))]
 )
-def test_consistent_images_end_the_error_of_another_sensor(signal: str, refused: range) -> None:
+def test_consistent_images_shorten_the_stretch_of_a_misfit(signal: str, refused: range) -> None:
     time_s = np.arange(0.0, 100.0)
     state = np.tile([2.0, 0.0, 0.0], (100, 1))
     spread = np.tile(np.diag([1e-4, 1e-4, 1e-4]), (100, 1, 1))

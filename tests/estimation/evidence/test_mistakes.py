@@ -48,7 +48,7 @@ def test_velocities_in_the_take_off_frame_are_rotated_back() -> None:
 
 
 @pytest.mark.heavy
-def test_of_similar_fits_the_correction_with_open_heading_is_taken() -> None:
+def test_corrections_that_leave_headings_open_win_among_similar_fits() -> None:
     """Here a yaw rate read as degrees is almost zero, and fits slightly better by chance."""
     wrong = turn_to_take_off_frame(build_pair(simulate_flight("in_view", "calibrated", 1002, 40.0)))
     as_degrees = BY_NAME["yaw rate fits if it is taken as degrees"].correct(wrong, 1)

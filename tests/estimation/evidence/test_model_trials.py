@@ -58,7 +58,7 @@ def add_flow_noise(pair: Pair, where: Array, seed: int = 5) -> Pair:
 
 
 @pytest.mark.heavy
-def test_models_are_scored_by_one_linearization_as_by_their_own() -> None:
+def test_scores_from_one_linearization_equal_those_of_each_model() -> None:
     base = solve_sound()
     candidates = [
         one for one in list_candidates() if not (one.model.for_a_while or one.model.sudden)
@@ -117,7 +117,7 @@ def test_levels_are_decoded_to_the_ends_of_the_flight() -> None:
 
 
 @pytest.mark.heavy
-def test_noise_for_a_while_is_found_and_widens_its_stretch_alone() -> None:
+def test_temporary_noise_is_found_and_widens_only_its_stretch() -> None:
     pair = build_pair(simulate_flight("room", "calibrated", 1003, 60.0))
     where = (pair.time_s > 20) & (pair.time_s < 35)
     base = solve_plain(add_flow_noise(pair, where))

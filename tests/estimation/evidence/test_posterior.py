@@ -29,7 +29,7 @@ def test_names_of_models_and_of_their_unknowns_are_distinct() -> None:
 @pytest.mark.parametrize(
     "candidate", list(list_candidates()), ids=lambda one: f"{one.model.name} {one.robot}"
 )
-def test_a_model_adds_its_unknowns_for_its_robot_alone(candidate: Candidate) -> None:
+def test_a_model_adds_unknowns_for_its_robot_only(candidate: Candidate) -> None:
     problem = build_problem(
         {(0, 1): build_pair(simulate_flight("in_view", "calibrated", 1000, 20.0))}
     )

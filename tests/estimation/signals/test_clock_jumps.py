@@ -56,7 +56,7 @@ def test_outliers_are_no_jump() -> None:
 
 
 @pytest.mark.heavy
-def test_short_or_unlike_series_show_none() -> None:
+def test_short_or_unlike_series_show_no_jump() -> None:
     short = LOG_S[:250]
     assert find_clock_jump(short, compute_distance(short), short, compute_distance(short)) is None
     assert find_clock_jump(short[:5], short[:5], short[:5], short[:5]) is None

@@ -156,7 +156,7 @@ def test_log_evidence_equals_laplace_approximation_by_quadrature() -> None:
 
 
 @pytest.mark.heavy
-def test_evidence_prefers_the_noise_that_is_there() -> None:
+def test_evidence_prefers_the_true_noise() -> None:
     pair = build_pair(simulate_flight("random", "calibrated", 1001, 40.0))
     problem = build_problem({(0, 1): pair})
     links = tuple(average_ranges(link, problem.keyframe_s) for link in problem.links)
@@ -174,7 +174,7 @@ def test_evidence_prefers_the_noise_that_is_there() -> None:
 
 
 def _true_values(pair: object, solver: Solver) -> Values:
-    """Return the true values of the flight of `test_evidence_prefers_the_noise_that_is_there`."""
+    """Return the true values of the flight of `test_evidence_prefers_the_true_noise`."""
     world, layout = simulate_flight("random", "calibrated", 1001, 40.0), solver.layout
     key_s = solver.problem.keyframe_s
     state = np.zeros((len(key_s), layout.width))
