@@ -1,5 +1,3 @@
-"""Positions of peers with statuses and covariances, from batch solves of simulated flights."""
-
 from dataclasses import replace
 from functools import cache
 
@@ -30,20 +28,20 @@ from dmrl.estimation.solver.problem import NoiseModel
 from dmrl.estimation.solver.residuals import Values
 from dmrl.flight import Trajectory
 
-from ..flights import build_pair, compute_truth, simulate_flight
+from ..flights import flown, pair_of, truth_at
 
 LONG_S = 60.0
 Both = tuple[Estimate, Estimate]
 
 
 @cache
-def solve_flight(trajectory: Trajectory, noise: str, seed: int) -> Both:
-    """Simulate and solve a flight of a minute, once for all tests; return both directions."""
-    (found,) = estimate_pairs([build_pair(simulate_flight(trajectory, noise, seed, LONG_S))])
+def solved(trajectory: Trajectory, noise: str, seed: int) -> Both:
+    """What a minute's flight of one pair is estimated to be: once, for every test that asks."""
+    (found,) = estimate_pairs([pair_of(flown(trajectory, noise, seed, LONG_S))])
     return found
 
 
-def compute_rmse(
+def rmse(
     estimate: Estimate,
     seed: int,
     noise: str = "calibrated",
@@ -51,19 +49,16 @@ def compute_rmse(
     *,
     duration_s: float = LONG_S,
 ) -> float:
-    """Return the RMSE after 20 s of an estimate of a flight in view, metres."""
-    flight = simulate_flight("in_view", noise, seed, duration_s)
+    flight = flown("in_view", noise, seed, duration_s)
     peer = "cf2" if own == "cf1" else "cf1"
-    error = estimate.state[:, :2] - compute_truth(flight, estimate.time_s, own, peer)
+    error = estimate.state[:, :2] - truth_at(flight, estimate.time_s, own, peer)
     settled = estimate.time_s - estimate.time_s[0] > 20
     return float(np.sqrt((error[settled] ** 2).sum(axis=1).mean()))
 
 
 def test_covariance_includes_distance_between_modes() -> None:
-    """The two solutions have equal weights and lie 1 m apart."""
-    problem = build_problem(
-        {(0, 1): build_pair(simulate_flight("in_view", "calibrated", 1000, 20.0))}
-    )
+    """Two solutions of one weight, 1 m apart."""
+    problem = build_problem({(0, 1): pair_of(flown("in_view", "calibrated", 1000, 20.0))})
     count, width = len(problem.keyframe_s), problem.layout.width
     state = np.zeros((count, width))
     state[:, 3] = 2.0
@@ -71,7 +66,7 @@ def test_covariance_includes_distance_between_modes() -> None:
     other[:, 3] += 1.0
     other[:, 5] += 2 * np.pi
     still = replace(
-        problem, robots=tuple(replace(r, path=_hold_still(r.path)) for r in problem.robots)
+        problem, robots=tuple(replace(r, path=_at_rest(r.path)) for r in problem.robots)
     )
     members = [
         Member(Solver(still), MapEstimate(Values(s, np.zeros(0)), 7.0), 0.0) for s in (state, other)
@@ -85,8 +80,7 @@ def test_covariance_includes_distance_between_modes() -> None:
     )
 
 
-def _hold_still(path: Odometry) -> Odometry:
-    """Return odometry of a robot that does not move."""
+def _at_rest(path: Odometry) -> Odometry:
     return replace(path, heading_rad=0 * path.heading_rad, position_m=0 * path.position_m)
 
 
@@ -109,20 +103,18 @@ def test_statuses_equal_the_schema() -> None:
 @pytest.mark.heavy
 def test_batch_solve_is_more_accurate_than_the_published_filter() -> None:
     seeds = (1000, 1001, 1002, 1003)
-    pairs = [build_pair(simulate_flight("in_view", "calibrated", seed, LONG_S)) for seed in seeds]
+    pairs = [pair_of(flown("in_view", "calibrated", seed, LONG_S)) for seed in seeds]
     published = [
-        compute_rmse(e, s) for e, s in zip(estimate_ekf(pairs, "published-sim"), seeds, strict=True)
+        rmse(e, s) for e, s in zip(estimate_ekf(pairs, "published-sim"), seeds, strict=True)
     ]
-    batch = [compute_rmse(solve_flight("in_view", "calibrated", s)[0], s) for s in seeds]
+    batch = [rmse(solved("in_view", "calibrated", s)[0], s) for s in seeds]
     assert np.median(batch) < np.median(published)
     assert max(batch) < 0.35
 
 
 @pytest.mark.heavy
 def test_noise_scale_orders_calibrated_realistic_and_harsh_sensors() -> None:
-    grades = [
-        solve_flight("in_view", n, 1001)[0].noise for n in ("calibrated", "realistic", "harsh")
-    ]
+    grades = [solved("in_view", n, 1001)[0].noise for n in ("calibrated", "realistic", "harsh")]
     assert grades[0].grade < grades[1].grade < grades[2].grade
     assert grades[0].grade < 0.8 < grades[2].grade
     assert grades[0].constants_grade >= 0.8
@@ -130,8 +122,8 @@ def test_noise_scale_orders_calibrated_realistic_and_harsh_sensors() -> None:
 
 @pytest.mark.heavy
 def test_both_directions_are_transforms_of_one_solve() -> None:
-    here, there = solve_flight("in_view", "calibrated", 1001)
-    assert compute_rmse(there, 1001, own="cf2") < 0.35
+    here, there = solved("in_view", "calibrated", 1001)
+    assert rmse(there, 1001, own="cf2") < 0.35
     assert np.allclose(transform_to_peer(there.state), here.state)
     again = seen_from_peer(seen_from_peer(here))
     assert np.allclose(again.covariance, here.covariance)
@@ -151,7 +143,7 @@ def test_both_directions_are_transforms_of_one_solve() -> None:
 def test_unobservable_bearing_is_ambiguous_with_a_reason(
     trajectory: Trajectory, noise: str
 ) -> None:
-    (estimate, _) = solve_flight(trajectory, noise, 1000)
+    (estimate, _) = solved(trajectory, noise, 1000)
     assert (estimate.status == room.AMBIGUOUS).mean() > 0.9
     reasons = {REASONS[reason] for reason in ("still", "alike", "open")}
     assert reasons & {cause.name for cause in estimate.causes}
@@ -164,13 +156,13 @@ def test_unobservable_bearing_is_ambiguous_with_a_reason(
 def test_unobservable_bearing_is_ambiguous_in_other_flights(
     trajectory: Trajectory, noise: str, seed: int
 ) -> None:
-    (estimate, _) = solve_flight(trajectory, noise, seed)
+    (estimate, _) = solved(trajectory, noise, seed)
     assert (estimate.status == room.AMBIGUOUS).mean() > 0.9
 
 
 @pytest.mark.heavy
 def test_no_position_is_ok_during_sensor_dropout() -> None:
-    pair = build_pair(simulate_flight("random", "calibrated", 1001, LONG_S))
+    pair = pair_of(flown("random", "calibrated", 1001, LONG_S))
     gap = (pair.time_s > 30) & (pair.time_s < 33)
     held = SensorTrack(*(np.where(gap, 0.0, signal) for signal in pair.own.signals()), gap)
     ((estimate, _),) = estimate_pairs(
@@ -183,7 +175,7 @@ def test_no_position_is_ok_during_sensor_dropout() -> None:
 
 @pytest.mark.heavy
 def test_no_position_is_ok_during_range_dropout_and_distance_stays_bounded() -> None:
-    pair = build_pair(simulate_flight("random", "calibrated", 1000, LONG_S))
+    pair = pair_of(flown("random", "calibrated", 1000, LONG_S))
     kept = (pair.range_time_s < 30) | (pair.range_time_s > 33)
     range_time_s, range_m = pair.range_time_s[kept], pair.range_m[kept]
     ((estimate, _),) = estimate_pairs([replace(pair, range_time_s=range_time_s, range_m=range_m)])
@@ -196,9 +188,9 @@ def test_no_position_is_ok_during_range_dropout_and_distance_stays_bounded() -> 
 @pytest.mark.heavy
 @pytest.mark.parametrize("fault", ["shadowed", "own bias", "peer bias", "offset"])
 def test_solve_is_robust_to_range_and_gyro_faults(fault: str) -> None:
-    # A flight of a minute determines an offset of the ranges too poorly to keep any position.
+    # A minute does not tell an offset of the ranges well enough to keep anything.
     duration_s = 100.0 if fault == "offset" else LONG_S
-    pair = build_pair(simulate_flight("in_view", "calibrated", 1002, duration_s))
+    pair = pair_of(flown("in_view", "calibrated", 1002, duration_s))
     if fault in ("shadowed", "offset"):
         burst = (pair.range_time_s > 30) & (pair.range_time_s < 33)
         longer = 0.35 if fault == "offset" else 1.0 * burst
@@ -209,13 +201,13 @@ def test_solve_is_robust_to_range_and_gyro_faults(fault: str) -> None:
         biased = replace(log, yaw_rate_radps=log.yaw_rate_radps + 0.05)
         pair = replace(pair, **{side: biased})
     ((estimate, _),) = estimate_pairs([pair])
-    assert compute_rmse(estimate, 1002, duration_s=duration_s) < 0.16
+    assert rmse(estimate, 1002, duration_s=duration_s) < 0.16
     assert (estimate.status == room.OK).mean() > 0.5
 
 
 @pytest.mark.heavy
 def test_a_flight_without_ranges_is_ambiguous() -> None:
-    pair = build_pair(simulate_flight("in_view", "calibrated", 1000, 20.0))
+    pair = pair_of(flown("in_view", "calibrated", 1000, 20.0))
     none = Pair(pair.time_s, pair.own, pair.peer, np.zeros(0), np.zeros(0))
     ((estimate, _),) = estimate_pairs([none])
     assert (estimate.status == room.AMBIGUOUS).all()
@@ -223,9 +215,7 @@ def test_a_flight_without_ranges_is_ambiguous() -> None:
 
 @pytest.mark.heavy
 def test_pairs_of_different_length_equal_separate_estimates() -> None:
-    pairs = [
-        build_pair(simulate_flight("in_view", "calibrated", 1000 + k, 4.0 + k)) for k in range(2)
-    ]
+    pairs = [pair_of(flown("in_view", "calibrated", 1000 + k, 4.0 + k)) for k in range(2)]
     together = estimate_pairs(pairs)
     for pair, (estimate, _) in zip(pairs, together, strict=True):
         ((alone, _),) = estimate_pairs([pair])

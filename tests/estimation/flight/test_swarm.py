@@ -15,8 +15,8 @@ from dmrl.estimation.model.status import AMBIGUOUS, OK
 from dmrl.estimation.solver.estimate import Estimate, seen_from_peer
 from dmrl.flight import NOISE, Fault, Flight, Scenario, Trajectory, simulate
 
-from ..flights import build_pair, compute_truth
-from ..sighted_flights import compute_rmse, simulate_bearings
+from ..flights import pair_of, truth_at
+from ..sighted_flights import rmse, sightings
 
 pytestmark = pytest.mark.heavy
 
@@ -25,27 +25,26 @@ Estimates = dict[Names, Estimate]
 
 
 @cache
-def solve_swarm(
+def solved(
     trajectory: Trajectory,
     noise: str,
     robots: int = 3,
     faults: tuple[Fault, ...] = (),
     duration_s: float = 40.0,
 ) -> tuple[Flight, dict[Names, Pair], Estimates, Estimates]:
-    """Simulate a flight; return it, its pairs, and the pairwise and the joint estimates."""
     flight = simulate(Scenario(robots, duration_s, trajectory), NOISE[noise], 1, faults)
-    pairs = {names: build_pair(flight, *names) for names in combinations(flight.robots, 2)}
+    pairs = {names: pair_of(flight, *names) for names in combinations(flight.robots, 2)}
     both: Estimates = {}
     for names, (here, there) in zip(pairs, estimate_pairs(list(pairs.values())), strict=True):
         both |= {names: here, names[::-1]: there}
     return flight, pairs, both, estimate_swarm(pairs, both)
 
 
-def compute_errors(flight: Flight, estimates: Estimates) -> np.ndarray:
-    """Return the horizontal errors of every ordered pair, metres."""
+def errors(flight: Flight, estimates: Estimates) -> np.ndarray:
+    """Horizontal errors of every ordered pair, metres."""
     return np.concatenate(
         [
-            np.linalg.norm(e.state[:, :2] - compute_truth(flight, e.time_s, *names), axis=1)
+            np.linalg.norm(e.state[:, :2] - truth_at(flight, e.time_s, *names), axis=1)
             for names, e in estimates.items()
         ]
     )
@@ -53,18 +52,18 @@ def compute_errors(flight: Flight, estimates: Estimates) -> np.ndarray:
 
 @pytest.mark.parametrize(("noise", "share"), [("calibrated", 1.0), ("realistic", 1.02)])
 def test_swarm_solve_is_as_accurate_as_pairwise_solves(noise: str, share: float) -> None:
-    """With little noise it is more accurate. Where a pair contradicts it, the pair's is kept."""
-    flight, _, pairwise, swarm = solve_swarm("in_view", noise)
+    """With little noise nearer; else, where a sure pair contradicts, they are the pairs' own."""
+    flight, _, pairwise, swarm = solved("in_view", noise)
     assert set(swarm) == set(pairwise)
-    one, other = (np.sqrt(np.mean(compute_errors(flight, e) ** 2)) for e in (pairwise, swarm))
+    one, other = (np.sqrt(np.mean(errors(flight, e) ** 2)) for e in (pairwise, swarm))
     assert other < share * one
 
 
 def test_swarm_covariances_cover_truth_and_ok_positions_are_accurate() -> None:
-    flight, _, _, swarm = solve_swarm("random", "realistic")
+    flight, _, _, swarm = solved("random", "realistic")
     inside, bad, kept = [], 0, 0
     for names, e in swarm.items():
-        error = e.state[:, :2] - compute_truth(flight, e.time_s, *names)
+        error = e.state[:, :2] - truth_at(flight, e.time_s, *names)
         squared = np.einsum("ki,kij,kj->k", error, np.linalg.inv(e.covariance[:, :2, :2]), error)
         inside.append((squared < 5.991).mean())
         bad += int((np.linalg.norm(error, axis=1)[e.status == OK] > 0.3).sum())
@@ -74,7 +73,7 @@ def test_swarm_covariances_cover_truth_and_ok_positions_are_accurate() -> None:
 
 
 def test_swarm_positions_are_consistent_around_a_triangle() -> None:
-    *_, swarm = solve_swarm("random", "realistic")
+    *_, swarm = solved("random", "realistic")
     one, two, three = (swarm[n].state for n in (("cf1", "cf2"), ("cf2", "cf3"), ("cf1", "cf3")))
     turn = np.exp(1j * one[:, 2])
     around = one[:, 0] + 1j * one[:, 1] + turn * (two[:, 0] + 1j * two[:, 1])
@@ -83,41 +82,41 @@ def test_swarm_positions_are_consistent_around_a_triangle() -> None:
 
 @pytest.mark.parametrize("trajectory", ["parallel", "hover"])
 def test_unobservable_swarm_motion_has_no_ok_positions(trajectory: Trajectory) -> None:
-    *_, swarm = solve_swarm(trajectory, "calibrated", duration_s=20.0)
+    *_, swarm = solved(trajectory, "calibrated", duration_s=20.0)
     for estimate in swarm.values():
         assert not (estimate.status == OK).any()
 
 
 def test_static_observer_has_ambiguous_bearings() -> None:
-    *_, swarm = solve_swarm("observer_static", "calibrated", duration_s=20.0)
+    *_, swarm = solved("observer_static", "calibrated", duration_s=20.0)
     for peer in ("cf2", "cf3"):
         assert (swarm["cf1", peer].status == AMBIGUOUS).mean() > 0.9
 
 
 def test_swarm_solve_leaves_a_single_pair_unchanged() -> None:
     names = ("cf1", "cf2")
-    pair = build_pair(simulate(Scenario(2, 10.0), NOISE["realistic"], 1))
+    pair = pair_of(simulate(Scenario(2, 10.0), NOISE["realistic"], 1))
     (estimate,) = estimate_ekf([pair], "published-sim")
     alone = {names: estimate, names[::-1]: seen_from_peer(estimate)}
     assert estimate_swarm({names: pair}, alone) == alone
 
 
 def test_shadowed_ranges_of_one_pair_do_not_bend_the_others() -> None:
-    # Two bursts of 3 s with ranges 1 m too long would move all three robots by 0.3 m.
+    # Ranges 1 m too long for 3 s, twice: taken as they are, all three robots were 0.3 m off.
     shadow = Fault("nlos", "cf1", "cf2", size=1.0, duration_s=3.0, number=2)
-    flight, pairs, both, swarm = solve_swarm("in_view", "calibrated", 3, (shadow,))
-    error = compute_errors(flight, swarm)
+    flight, pairs, both, swarm = solved("in_view", "calibrated", 3, (shadow,))
+    error = errors(flight, swarm)
     kept = np.concatenate([e.status == OK for e in swarm.values()])
     assert kept.mean() > 0.5
     assert (error[kept] > 0.3).mean() < 0.02
-    # Without the estimated range errors the joint solve is worse.
+    # Without the unknown of the range error the joint solve is worse.
     blind = {names: replace(e, range_error_m=None) for names, e in both.items()}
-    without = compute_errors(flight, estimate_swarm(pairs, blind))
+    without = errors(flight, estimate_swarm(pairs, blind))
     assert np.sqrt((error**2).mean()) < np.sqrt((without**2).mean())
 
 
 def test_swarm_estimate_inconsistent_with_pair_is_detected() -> None:
-    *_, pairwise, swarm = solve_swarm("in_view", "calibrated")
+    *_, pairwise, swarm = solved("in_view", "calibrated")
     names = ("cf1", "cf2")
     assert not is_inconsistent(swarm[names], pairwise[names])
     bent = replace(swarm[names], state=swarm[names].state + np.array([0.5, 0.0, 0.0]))
@@ -127,7 +126,7 @@ def test_swarm_estimate_inconsistent_with_pair_is_detected() -> None:
 def test_clock_offset_is_estimated_in_a_swarm() -> None:
     late_s = 0.06
     flight = simulate(Scenario(3, 40.0, "random"), NOISE["calibrated"], 1)
-    pairs = {names: build_pair(flight, *names) for names in combinations(flight.robots, 2)}
+    pairs = {names: pair_of(flight, *names) for names in combinations(flight.robots, 2)}
 
     def delay(pair: Pair, side: str) -> Pair:
         """Return the pair with one robot's log stamped late."""
@@ -150,8 +149,8 @@ def test_clock_offset_is_estimated_in_a_swarm() -> None:
 
 
 def test_detections_improve_a_swarm_solve() -> None:
-    flight, pairs, both, swarm = solve_swarm("in_view", "calibrated")
-    sees = simulate_bearings(flight, "cf1", ("cf2",))
+    flight, pairs, both, swarm = solved("in_view", "calibrated")
+    sees = sightings(flight, "cf1", ("cf2",))
     looking = {
         names: replace(pair, own_bearings=sees) if names == ("cf1", "cf2") else pair
         for names, pair in pairs.items()
@@ -159,18 +158,18 @@ def test_detections_improve_a_swarm_solve() -> None:
     seen = estimate_swarm(looking, both)
     names = ("cf1", "cf2")
     error = [
-        compute_rmse(found[names].state[:, :2], compute_truth(flight, found[names].time_s, *names))
+        rmse(found[names].state[:, :2], truth_at(flight, found[names].time_s, *names))
         for found in (swarm, seen)
     ]
     assert error[1] < 0.7 * error[0]
 
 
 def test_a_long_swarm_is_solved_in_windows(monkeypatch: pytest.MonkeyPatch) -> None:
-    flight, pairs, both, whole = solve_swarm("random", "calibrated")
+    flight, pairs, both, whole = solved("random", "calibrated")
     monkeypatch.setattr(windows, "WINDOW_S", 16.0)
     monkeypatch.setattr(windows, "OVERLAP_S", 6.0)
     parts = estimate_swarm(pairs, both)
     names = ("cf1", "cf2")
     assert parts[names].time_s == pytest.approx(whole[names].time_s)
-    rms = [float(np.sqrt((compute_errors(flight, e) ** 2).mean())) for e in (whole, parts)]
+    rms = [float(np.sqrt((errors(flight, e) ** 2).mean())) for e in (whole, parts)]
     assert rms[1] < 1.5 * rms[0] + 0.02
