@@ -6,7 +6,7 @@ from os import PathLike
 from typing import Any, Literal, TypedDict
 
 class LabelSettings(TypedDict, total=False):
-    method: Literal["batch", "swarm", "ekf"]
+    method: Literal["swarm", "batch", "ekf"]
     preset: Literal["published-sim", "published-firmware"]
     gate_m: float
     bad_share: float

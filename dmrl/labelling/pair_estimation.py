@@ -1,12 +1,12 @@
 """Estimate all pairs of robots of a flight, in groups, side by side."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 from dmrl.estimation.flight.data_association import resolve_conflicts
 from dmrl.estimation.flight.pairs import estimate_ekf, estimate_pairs
-from dmrl.estimation.flight.swarm import estimate_swarm
+from dmrl.estimation.flight.swarm import estimate_swarm, select_connected
 from dmrl.estimation.model.gate import Gate
 from dmrl.estimation.model.pair import Pair
 from dmrl.estimation.solver.estimate import Estimate
@@ -40,18 +40,21 @@ class PairSolver:
         Noise of the method "ekf".
     gate
         Gate of the positions.
+    plain
+        Without error models beyond the plain one.
     """
 
     method: Method
     preset: str
     gate: Gate
+    plain: bool = False
 
     def solve(self, pairs: list[Pair]) -> Sequence[tuple[Estimate, Estimate | None]]:
         """Return the estimates of the peer and, unless the method is "ekf", of the observer."""
         keep_freed_memory(KEPT_BYTES)
         if self.method == "ekf":
             return [(one, None) for one in estimate_ekf(pairs, self.preset, gate=self.gate)]
-        return estimate_pairs(pairs, gate=self.gate)
+        return estimate_pairs(pairs, gate=self.gate, plain=self.plain)
 
 
 def orient_pair(pairs: Mapping[RobotPair, Pair], name: RobotPair) -> Pair:
@@ -64,6 +67,9 @@ def estimate_all(
 ) -> dict[RobotPair, Estimate]:
     """Estimate every ordered pair; solve those again that claim the same detections.
 
+    Robots that ranges connect are estimated together by the method "swarm". Those that this does
+    not explain are estimated pair by pair.
+
     Parameters
     ----------
     pairs
@@ -73,7 +79,12 @@ def estimate_all(
     workers, spread
         Most processes, and the function that runs them.
     """
-    estimates = _estimate(pairs, solver, workers, spread)
+    together = {}
+    if solver.method == "swarm" and (connected := select_connected(pairs)):
+        starts = _estimate(connected, replace(solver, plain=True), workers, spread)
+        together = estimate_swarm(connected, starts, gate=solver.gate)
+    alone = {names: pair for names, pair in pairs.items() if names not in together}
+    estimates = together | _estimate(alone, solver, workers, spread)
     if again := resolve_conflicts(pairs, estimates):
         estimates |= _estimate(again, solver, workers, spread)
     return dict(sorted(estimates.items()))
@@ -97,4 +108,4 @@ def _estimate(
             out[name] = of_peer
             if of_observer is not None:
                 out[name[::-1]] = of_observer
-    return estimate_swarm(pairs, out, gate=solver.gate) if solver.method == "swarm" else out
+    return out

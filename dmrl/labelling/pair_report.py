@@ -50,7 +50,7 @@ REMEDIES = {
     "robot": "The ranges then show no bearing. Let both fly about, different ways",
     "sensors": "Or do odometry and ranges contradict each other? Check the signs and frames of "
     "both robots: docs/own_robot.md",
-    "bearing": "Fly longer and faster, with turns; with a third robot try --method swarm",
+    "bearing": "Fly longer and faster, with turns, or with a third robot",
     "positions": "A wider --gate-m takes more: see docs/labelling.md",
     "robots": "Fly different ways, or exchange the names of the robots",
 }

@@ -26,8 +26,8 @@ class Settings:
     Parameters
     ----------
     method
-        "batch": the whole flight at once, pair by pair. "swarm": then all robots together, where
-        ranges connect three or more. "ekf": the published filter, online, from (0, 0, 0).
+        "swarm": the whole flight at once, and all robots together that ranges connect. "batch": the
+        same, pair by pair. "ekf": the published filter, online, from (0, 0, 0).
     preset
         ekf: its noise, as published for simulation or in the firmware.
     gate_m
@@ -57,7 +57,7 @@ class Settings:
         left out and counted.
     """
 
-    method: Literal["batch", "swarm", "ekf"] = "batch"
+    method: Literal["swarm", "batch", "ekf"] = "swarm"
     preset: Literal["published-sim", "published-firmware"] = "published-sim"
     gate_m: Positive = GATE_M
     bad_share: Annotated[float, Parameter(validator=validators.Number(gt=0, lt=1))] = BAD_SHARE

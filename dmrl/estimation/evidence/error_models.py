@@ -64,20 +64,22 @@ class ErrorModel:
     sudden: bool = False
     log_odds: float = RARE
 
-    def owners(self) -> tuple[int | None, ...]:
-        """Return the robots of a pair whose sensor it may be; None: the pair's."""
+    def owners(self, robots: int) -> tuple[int | None, ...]:
+        """Return which of some robots may have the sensor; None: all ranges, or the flight."""
+        every = tuple(range(robots))
         if self.flow_factor != 1.0 or self.for_a_while:
-            return 0, 1
+            return every
         if not self.rows:
             return (None,)
-        if self.rows[0].height:
+        if self.rows[0].height and robots == 2:
             return (1,)  # ranges show the difference of the heights alone
-        return {"robot": (0, 1), "antenna": (0, 1), "clock": (1,)}.get(self.rows[0].owner, (None,))
+        owned = {"robot": every, "antenna": every, "clock": every[1:]}
+        return owned.get(self.rows[0].owner, (None,))
 
 
 @dataclass(frozen=True, slots=True)
 class Candidate:
-    """An error model of one robot, or of the pair."""
+    """An error model of one robot, or of all ranges."""
 
     model: ErrorModel
     robot: int | None
@@ -347,8 +349,8 @@ MODELS: tuple[ErrorModel, ...] = (
 )
 
 
-def list_candidates() -> Iterator[Candidate]:
+def list_candidates(robots: int = 2) -> Iterator[Candidate]:
     """Yield every model for each robot that it may concern."""
     for model in MODELS:
-        for robot in model.owners():
+        for robot in model.owners(robots):
             yield Candidate(model, robot)

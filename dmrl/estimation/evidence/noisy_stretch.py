@@ -35,7 +35,7 @@ def find_noisy_steps(
     """
     step_s = solver.problem.robots[robot].steps_s
     window = ((np.cumsum(step_s) - step_s / 2) / WINDOW_S).astype(int)
-    square = _velocity_squares(solver, values, robot)
+    square = sum_velocity_squares(solver, values, robot)
     level = np.bincount(window, square) / np.maximum(np.bincount(window), 1)
     if len(level) < 3:
         return None
@@ -45,7 +45,7 @@ def find_noisy_steps(
     return noisy[window] if gain > least_gain else None
 
 
-def _velocity_squares(solver: Solver, values: Values, robot: int) -> Array:
+def sum_velocity_squares(solver: Solver, values: Values, robot: int) -> Array:
     """Return (S,) squares of the velocity errors of a robot, relative to their noise."""
     factors = solver.linearize(values)
     odometry = [factor for factor in factors if isinstance(factor, Rows) and factor.steps][robot]

@@ -61,8 +61,13 @@ class Mixture:
         return out
 
 
-def weigh_models(solver: Solver, modes: Sequence[MapEstimate], others: Others = tuple) -> Mixture:
-    """Return the mixture of a flight's solutions under all error models.
+def weigh_models(
+    solver: Solver,
+    modes: Sequence[MapEstimate],
+    others: Others = tuple,
+    candidates: Sequence[Candidate] | None = None,
+) -> Mixture:
+    """Return the mixture of a flight's solutions under error models.
 
     Parameters
     ----------
@@ -72,6 +77,8 @@ def weigh_models(solver: Solver, modes: Sequence[MapEstimate], others: Others = 
         Its distinct solutions, best first.
     others
         Returns solutions with yaw rate biases that change, in the layout of the flight.
+    candidates
+        The error models. None: all that the flight can show.
     """
     # The noise of the output is wider than the likeliest one, which compares models.
     solver = with_grade(solver, max(solver.problem.noise.grade / GRADE_BIAS, MIN_GRADE))
@@ -83,12 +90,11 @@ def weigh_models(solver: Solver, modes: Sequence[MapEstimate], others: Others = 
         for mode in modes[1:]
     ]
     best, rounds = plain, []
-    candidates = list_shown(solver.problem)
+    candidates = list_shown(solver.problem) if candidates is None else candidates
     for _ in range(MAX_MODELS):
         tried = try_models(best, candidates, others)
-        leader = max(tried, key=lambda one: one.score, default=best)
         members += tried
-        if leader.score < best.score:
+        if not tried or (leader := max(tried, key=lambda one: one.score)).score < best.score:
             break
         rounds.append((leader.models[-1], _list_rivals(leader, tried)))
         best = select_grade(leader)
@@ -110,7 +116,7 @@ def list_shown(problem: Problem) -> list[Candidate]:
     moves = [odometry_energy(problem, k) >= MIN_MOTION_ENERGY for k in range(len(problem.robots))]
     return [
         one
-        for one in list_candidates()
+        for one in list_candidates(len(problem.robots))
         if not (coarse and one.model.sudden)
         and not (ranged and any(row.name == "clock_free" for row in one.model.rows))
         and (

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.ndimage import median_filter
 
 from dmrl.estimation.evidence.causes import join_causes, join_innovations
-from dmrl.estimation.flight.pair_solver import PairSolution, squared_distances
+from dmrl.estimation.flight.pair_solver import WindowSolution, squared_distances
 from dmrl.estimation.model.bearings import ASSOCIATION_GATE
 from dmrl.estimation.model.gate import Gate
 from dmrl.estimation.model.odometry import rotate, rotation_matrix
@@ -79,7 +79,9 @@ def interpolate_states(problem: Problem, state: Array, time_s: Array) -> Array:
     return out
 
 
-def mix_members(solution: PairSolution, time_s: Array) -> tuple[Array, Array]:
+def mix_members(
+    solution: WindowSolution, time_s: Array, both: tuple[int, int] = (0, 1)
+) -> tuple[Array, Array]:
     """Return (T, 3) means and (T, 3, 3) covariances of the peer's pose over all likely solutions.
 
     Parameters
@@ -88,12 +90,14 @@ def mix_members(solution: PairSolution, time_s: Array) -> tuple[Array, Array]:
         Solutions under likely models.
     time_s
         (T,) times, seconds.
+    both
+        Observer and peer.
     """
     states, spreads = [], []
     for member, covariances in zip(solution.mixture.members, solution.covariances, strict=True):
         problem, state = member.solver.problem, member.values.state
-        states.append(relative_path(interpolate_states(problem, state, time_s)))
-        spread = covariances.relative(state)
+        states.append(relative_path(interpolate_states(problem, state, time_s), *both))
+        spread = covariances.relative(state, *both)
         spreads.append(interpolate_at(time_s, problem.keyframe_s, spread))
     weight, apart = solution.mixture.weight, np.stack(states) - states[0]
     apart[..., 2] = np.angle(np.exp(1j * apart[..., 2]))
@@ -136,7 +140,7 @@ def height_errors(
     return error, np.sqrt(variance)
 
 
-def mix_clocks(solution: PairSolution, time_s: Array) -> tuple[Array, Array]:
+def mix_clocks(solution: WindowSolution, time_s: Array) -> tuple[Array, Array]:
     """Return (T,) mean offsets of the second robot's clock over all solutions, and variances.
 
     Parameters
@@ -178,7 +182,7 @@ def to_peer_clock(estimate: Estimate) -> Estimate:
     return replace(estimate, time_s=time_s, covariance=covariance)
 
 
-def list_sighted(solution: PairSolution, time_s: Array) -> Mask:
+def list_sighted(solution: WindowSolution, time_s: Array) -> Mask:
     """Return (2, T) whether an image of either robot near a time is consistent."""
     out = np.zeros((2, len(time_s)), bool)
     for view in solution.problem.views:

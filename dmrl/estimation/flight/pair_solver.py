@@ -41,8 +41,8 @@ other objects also agree with a wrong solution by chance: one in twenty did."""
 
 
 @dataclass(frozen=True, slots=True)
-class PairSolution:
-    """Solution of a window of a pair.
+class WindowSolution:
+    """Solution of a window of a flight.
 
     Parameters
     ----------
@@ -77,7 +77,7 @@ def solve_pair(
     carried: Carried | None = None,
     *,
     plain: bool = False,
-) -> PairSolution:
+) -> WindowSolution:
     """Solve a flight of two robots.
 
     Parameters
@@ -103,7 +103,7 @@ def solve_pair(
     else:
         mixture = weigh_models(solver, found, cache(lambda: _find_others(problem, tracks, found)))
     covariances = [compute_covariance(one.solver, one.values) for one in mixture.members]
-    return PairSolution(mixture, covariances)
+    return WindowSolution(mixture, covariances)
 
 
 def _find_others(

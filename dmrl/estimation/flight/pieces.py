@@ -23,7 +23,7 @@ from dmrl.estimation.flight.pair_output import (
     motion_energy,
     output_times,
 )
-from dmrl.estimation.flight.pair_solver import PairSolution, solve_pair
+from dmrl.estimation.flight.pair_solver import WindowSolution, solve_pair
 from dmrl.estimation.flight.windows import carry_information, split_windows
 from dmrl.estimation.model.pair import MAX_DROPOUT_S, Array, Mask, Pair
 from dmrl.estimation.solver.estimate import Estimate
@@ -93,7 +93,7 @@ def solve_pieces(
 
 
 def _to_piece(
-    solution: PairSolution, pair: Pair, time_s: Array, late: Sequence[Candidate]
+    solution: WindowSolution, pair: Pair, time_s: Array, late: Sequence[Candidate]
 ) -> Piece:
     """Return the estimate of a solved window at some times."""
     problem, values, key_s = solution.problem, solution.values, solution.problem.keyframe_s
@@ -127,12 +127,12 @@ def _to_piece(
     silent = odometry_dropout(pair, time_s) | noisy
     silent |= find_contradicted_steps(problem, values)[step]
     sighted, energy = list_sighted(solution, time_s), motion_energy(problem, values)
-    chance = _compute_prior_chance(problem, values)
+    chance = compute_prior_chance(problem, values)
     delay = find_delay(solution.mixture, covariances.constants, late)
     return Piece(estimate, silent, sighted, energy, noisy, chance, delay)
 
 
-def _compute_prior_chance(problem: Problem, values: Values) -> float:
+def compute_prior_chance(problem: Problem, values: Values) -> float:
     """Return the probability of larger constants and first values, by their priors.
 
     It is that of all of them (chi-square), or of the largest (Bonferroni), whichever is less.
@@ -150,7 +150,7 @@ def _compute_prior_chance(problem: Problem, values: Values) -> float:
     return float(min(chdtrc(max(len(sigmas), 1), (sigmas**2).sum()), largest))
 
 
-def _with_fit(piece: Piece, solution: PairSolution) -> Piece:
+def _with_fit(piece: Piece, solution: WindowSolution) -> Piece:
     """Return the estimate of a window with its goodness of fit."""
     estimate = piece.estimate
     ends = float(estimate.time_s[0]), float(estimate.time_s[-1])
@@ -159,8 +159,10 @@ def _with_fit(piece: Piece, solution: PairSolution) -> Piece:
     return piece._replace(estimate=replace(estimate, causes=causes, innovations=innovations))
 
 
-def find_contradicted_steps(problem: Problem, values: Values) -> Mask:
-    """Return (S,) the steps at which odometry or most ranges contradict the solution.
+def find_contradicted_steps(
+    problem: Problem, values: Values, both: tuple[int, int] = (0, 1)
+) -> Mask:
+    """Return (S,) the steps at which odometry or most ranges of a pair contradict the solution.
 
     The half second around them counts too.
 
@@ -168,18 +170,20 @@ def find_contradicted_steps(problem: Problem, values: Values) -> Mask:
     ----------
     problem, values
         Flight and its solution.
+    both
+        Observer and peer.
     """
     layout, wrong = problem.layout, np.zeros(len(problem.keyframe_s) - 1, bool)
-    for robot in range(len(problem.robots)):
+    for robot in both:
         rows = odometry_factor(problem, layout, robot, values)
         wrong |= (rows.square > CONTRADICTED_SIGMAS**2).any(axis=1)
     for k, ((_, own), row) in enumerate(layout.states):
-        if row.motion and row.evolution == "fading":
+        if row.motion and row.evolution == "fading" and own[0] in both:
             error = np.abs(values.state[:, 3 * layout.robots + k]) / (row.std * problem.noise.grade)
             sigmas = np.maximum(error[1:], error[:-1]) / problem.robots[own[0]].grade
             wrong |= sigmas > CONTRADICTED_SIGMAS
     around = round(MAX_DROPOUT_S / float(np.median(np.diff(problem.keyframe_s))))
-    for link in problem.links:
+    for link in (one for one in problem.links if set(one.robots) == set(both)):
         found = range_factor(problem, layout, link, values)
         far = (found.weight * (found.square > CONTRADICTED_RANGE_SIGMAS**2)).sum(axis=1)
         near = found.weight.sum(axis=1) - far

@@ -1,175 +1,254 @@
 """Estimate all robots of a flight in one frame, from all their measurements at once.
 
-The solutions of the pairs are the first guess. A third robot often resolves a bearing that a pair
-leaves open: its ranges cross theirs, and each robot's odometry enters once instead of in each pair.
+Solutions of the pairs under the plain model are the first guess. A third robot often resolves a
+bearing that a pair leaves open: its ranges cross theirs, and each robot's odometry enters once
+instead of in each pair. Error models are tried if the plain model does not fit. A robot whose
+signals no model explains is left out, and the others are solved without it.
 """
 
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 
 import numpy as np
-from scipy.special import gammaincinv
 
+from dmrl.estimation.evidence.clock_shifts import find_clock_shift
+from dmrl.estimation.evidence.delays import SIGNALS
+from dmrl.estimation.evidence.error_models import Candidate
+from dmrl.estimation.evidence.goodness_of_fit import FALSE_ALARM, check_fit
+from dmrl.estimation.evidence.model_trials import Member
+from dmrl.estimation.evidence.noisy_stretch import sum_velocity_squares
+from dmrl.estimation.evidence.posterior import Mixture, list_shown, weigh_models
 from dmrl.estimation.flight.pair_output import (
-    height_errors,
-    interpolate_at,
-    interpolate_states,
-    join_estimates,
-    motion_energy,
     output_times,
-    with_status,
 )
-from dmrl.estimation.flight.pair_solver import consistent_views
+from dmrl.estimation.flight.pair_solver import WindowSolution, consistent_views
+from dmrl.estimation.flight.pairs import MIN_PRIOR_CHANCE, MISFIT_GRADE
+from dmrl.estimation.flight.pieces import compute_prior_chance
+from dmrl.estimation.flight.swarm_output import Names, SwarmPart, estimate_directions
 from dmrl.estimation.flight.windows import carry_information, split_windows
 from dmrl.estimation.model.gate import DEFAULT_GATE, Gate
 from dmrl.estimation.model.odometry import rotate, rotation_matrix
-from dmrl.estimation.model.pair import Array, Mask, Pair
-from dmrl.estimation.model.status import OK
-from dmrl.estimation.signals.contradictions import drop_contradictions
+from dmrl.estimation.model.pair import Array, Pair
+from dmrl.estimation.signals.contradictions import drop_contradictions, drop_held_ranges
 from dmrl.estimation.solver.camera_noise import calibrate_views
-from dmrl.estimation.solver.covariance import Covariances, compute_covariance
-from dmrl.estimation.solver.estimate import PAIR_LAYOUT, REASONS, Estimate
+from dmrl.estimation.solver.covariance import compute_covariance
+from dmrl.estimation.solver.estimate import Cause, Estimate
 from dmrl.estimation.solver.keyframes import (
     build_problem,
     list_robots,
-    odometry_dropout,
-    range_dropout,
 )
-from dmrl.estimation.solver.layout import Layout
-from dmrl.estimation.solver.levenberg_marquardt import (
-    ROUGH_TOLERANCE,
-    Solver,
-    relative_path,
-)
+from dmrl.estimation.solver.levenberg_marquardt import ROUGH_TOLERANCE, MapEstimate, Solver
 from dmrl.estimation.solver.priors import Carried
 from dmrl.estimation.solver.problem import Problem
 from dmrl.estimation.solver.residuals import Values
+from dmrl.guards.memory import return_freed_memory
 
-Names = tuple[str, str]
-MIN_SHARED_S = 5.0
-"""Shortest time with data of all robots that is solved, seconds: that of a pair."""
+MIN_SHARED_SHARE = 0.95
+"""Smallest share of the longest pair's time that all robots share. A robot that flies for a shorter
+time is left out, as the others would lose the rest of their flight."""
 MIN_RANGE_ERROR_M = 0.05
 """Temporary excess of a pair's ranges from which the joint solve estimates it too, metres: half the
 noise of a range."""
-CONSISTENCY_PROBABILITY, MAX_OUTSIDE_SHARE = 0.99, 0.2
-"""A solution is rejected if more than the second share of another one's OK positions have it
-outside their ellipse of the first probability."""
 
 
 def estimate_swarm(
-    pairs: Mapping[Names, Pair], estimates: Mapping[Names, Estimate], *, gate: Gate = DEFAULT_GATE
+    pairs: Mapping[Names, Pair], starts: Mapping[Names, Estimate], *, gate: Gate = DEFAULT_GATE
 ) -> dict[Names, Estimate]:
-    """Estimate every ordered pair; robots in no group of three keep their estimates.
+    """Estimate the robots of every group of three or more that ranges connect.
 
     Parameters
     ----------
     pairs
         Sensor data, each pair once. A robot's log is the same in all of them.
-    estimates
-        Estimates of every ordered pair, by pairs.
+    starts
+        Estimates of every ordered pair under the plain model.
     gate
         Gate of the positions.
+
+    Returns
+    -------
+    dict
+        Estimates of the ordered pairs of all robots that an error model, or none, explains.
     """
-    out = dict(estimates)
-    for group in _find_groups(pairs):
-        mine = {names: drop_contradictions(p) for names, p in pairs.items() if names[0] in group}
-        start_s = max(p.time_s[0] for p in mine.values())
-        end_s = min(p.time_s[-1] for p in mine.values())
-        if len(group) > 2 and end_s - start_s >= MIN_SHARED_S:
-            theirs = {names: e for names, e in estimates.items() if names[0] in group}
-            together = _estimate_group(mine, theirs, (start_s, end_s), gate)
-            # An error without a model bends the joint solve, which then contradicts a pair.
-            bent = any(is_inconsistent(together[names], found) for names, found in theirs.items())
-            out |= {} if bent else together
+    out: dict[Names, Estimate] = {}
+    for group in (one for one in _find_groups(pairs) if len(one) > 2):
+        out |= _estimate_group({n: p for n, p in pairs.items() if n[0] in group}, starts, gate)
     return out
 
 
-def is_inconsistent(whole: Estimate, sure: Estimate) -> bool:
-    """Return whether a solution fails a chi-square test against another one's confident positions.
+def _estimate_group(
+    pairs: Mapping[Names, Pair], starts: Mapping[Names, Estimate], gate: Gate
+) -> dict[Names, Estimate]:
+    """Return the estimates of a group without the robots that no model explains."""
+    if any(find_clock_shift(pair) for pair in pairs.values()):
+        return {}
+    used = {names: drop_contradictions(drop_held_ranges(pair)) for names, pair in pairs.items()}
+    left_out = _find_shortest_log(used)
+    if left_out is None:
+        mine = {names: starts[names] for names in starts if {*names} <= {*list_robots(pairs)}}
+        parts, fault = _solve_group(used, mine)
+        if fault is None:
+            return estimate_directions(pairs, used, parts, gate)
+        left_out = list_robots(pairs)[fault.robot or 0]
+    rest = {names: pair for names, pair in pairs.items() if left_out not in names}
+    return estimate_swarm(rest, starts, gate=gate)
 
-    Parameters
-    ----------
-    whole
-        Solution to test.
-    sure
-        Another solution of the same ordered pair, of the same time or a part of it.
-    """
-    xy, _, _ = whole.interpolate_at(sure.time_s)
-    known = sure.status == OK
-    if not known.any():
-        return False
-    apart = (xy - sure.state[:, :2])[known]
-    information = np.linalg.inv(sure.covariance[known, :2, :2])
-    # Squared Mahalanobis distances are chi-square with two degrees of freedom if both are right.
-    squared = np.einsum("ki,kij,kj->k", apart, information, apart)
-    return bool(
-        (squared > 2 * gammaincinv(1.0, CONSISTENCY_PROBABILITY)).mean() > MAX_OUTSIDE_SHARE
-    )
+
+def _find_shortest_log(pairs: Mapping[Names, Pair]) -> str | None:
+    """Return the robot whose log shortens the time of all robots most; None if all are alike."""
+    ends = {
+        robot: (
+            # A pair ends with the shorter log, so the longest pair of a robot shows its own.
+            min(pair.time_s[0] for names, pair in pairs.items() if robot in names),
+            max(pair.time_s[-1] for names, pair in pairs.items() if robot in names),
+        )
+        for robot in list_robots(pairs)
+    }
+    shared_s = min(end for _, end in ends.values()) - max(start for start, _ in ends.values())
+    longest_s = max(pair.time_s[-1] - pair.time_s[0] for pair in pairs.values())
+    if shared_s >= MIN_SHARED_SHARE * longest_s:
+        return None
+    return min(ends, key=lambda robot: ends[robot][1] - ends[robot][0])
+
+
+def select_connected(pairs: Mapping[Names, Pair]) -> dict[Names, Pair]:
+    """Return the pairs of robots that are in a group of three or more."""
+    large = [group for group in _find_groups(pairs) if len(group) > 2]
+    return {n: pair for n, pair in pairs.items() if any(n[0] in group for group in large)}
 
 
 def _find_groups(pairs: Mapping[Names, Pair]) -> list[set[str]]:
     """Return groups of robots that ranges connect."""
     groups: list[set[str]] = []
-    for names in pairs:
+    for names in (names for names, pair in pairs.items() if len(pair.range_m)):
         touched = [group for group in groups if group & set(names)]
         groups = [group for group in groups if group not in touched]
         groups.append(set(names).union(*touched))
     return groups
 
 
-def _estimate_group(
-    pairs: Mapping[Names, Pair],
-    estimates: Mapping[Names, Estimate],
-    shared_s: tuple[float, float],
-    gate: Gate,
-) -> dict[Names, Estimate]:
-    """Return the estimates of one group, from the solve over all its robots."""
-    names, parts = list_robots(pairs), list(_solve_windows(pairs, estimates, shared_s))
-    out = {}
-    for one, other in estimates:
-        pair = pairs[one, other] if (one, other) in pairs else pairs[other, one]
-        both = names.index(one), names.index(other)
-        seen = join_estimates([_select_pair(part, both) for part in parts])
-        energy = np.mean(
-            [motion_energy(solver.problem, v, *both) for solver, v, *_ in parts], axis=0
-        )
-        silent: Mask = odometry_dropout(pair, seen.time_s) | range_dropout(pair, seen.time_s)
-        # The reason why a pair was refused alone need not hold for the swarm.
-        causes = tuple(c for c in estimates[one, other].causes if c.name not in REASONS.values())
-        seen = replace(seen, causes=causes)
-        out[one, other] = with_status(seen, silent, (energy[0], energy[2]), gate)
-    return out
-
-
-Part = tuple[Solver, Values, Covariances, Array]
-"""A window: its solver, values, covariances, and output times."""
+def _solve_group(
+    pairs: Mapping[Names, Pair], starts: Mapping[Names, Estimate]
+) -> tuple[list[SwarmPart], Cause | None]:
+    """Return the windows of one group, up to the first that no model explains, and its fault."""
+    start_s = max(pair.time_s[0] for pair in pairs.values())
+    end_s = min(pair.time_s[-1] for pair in pairs.values())
+    parts: list[SwarmPart] = []
+    for part in _solve_windows(pairs, starts, (start_s, end_s)):
+        parts.append(part)
+        if part.fault is not None:
+            return parts, part.fault
+    return parts, None
 
 
 def _solve_windows(
-    pairs: Mapping[Names, Pair], estimates: Mapping[Names, Estimate], shared_s: tuple[float, float]
-) -> Iterator[Part]:
+    pairs: Mapping[Names, Pair], starts: Mapping[Names, Estimate], shared_s: tuple[float, float]
+) -> Iterator[SwarmPart]:
     """Solve all robots window by window."""
     carried: Carried | None = None
     names = list_robots(pairs)
     for window in split_windows(*shared_s):
+        return_freed_memory()  # of the pairs, and of the window before
         cut = {both: pair.crop(window.start_s, window.end_s) for both, pair in pairs.items()}
         numbered = {(names.index(a), names.index(b)): pair for (a, b), pair in cut.items()}
-        problem = _with_pair_models(build_problem(numbered), names, estimates)
-        start = Values(
-            _initial_state(problem, names, estimates), np.zeros(len(problem.layout.constants))
-        )
-        views = consistent_views(problem, start)
-        kept = replace(problem, views=views)
-        start = Values(start.state, np.zeros(len(kept.layout.constants)))
+        problem = _with_pair_models(build_problem(numbered), names, starts)
+        start = _first_guess(problem, names, starts)
+        kept = replace(problem, views=consistent_views(problem, start))
         if kept.layout.width != problem.layout.width:
-            start = Values(_initial_state(kept, names, estimates), start.constants)
+            start = _first_guess(kept, names, starts)
+        start = Values(start.state, np.zeros(len(kept.layout.constants)))
         solver = Solver(kept, carried)
         solver, found = calibrate_views(solver, solver.solve(start, tolerance=ROUGH_TOLERANCE))
-        values = found.values
         first = next(iter(pairs.values()))
         times = output_times(first.time_s[0], window.from_s, window.until_s)
-        yield solver, values, compute_covariance(solver, values), times
-        carried = None if window.is_last else carry_information(solver, values, window.next_s)
+        part = _weigh_window(solver, found, times)
+        yield part
+        best = part.solution
+        carried = (
+            None if window.is_last else carry_information(best.solver, best.values, window.next_s)
+        )
+
+
+def _weigh_window(solver: Solver, found: MapEstimate, time_s: Array) -> SwarmPart:
+    """Return a window under the plain model, or under error models where that does not fit.
+
+    Constants of the robots are cheap to screen, and show most errors. Errors that change over time
+    are tried if a constant explains something, or if the window does not fit.
+
+    Parameters
+    ----------
+    solver, found
+        Flight under the plain model, and its solution.
+    time_s
+        (T,) output times, seconds.
+    """
+    listed = [one for one in list_shown(solver.problem) if _suits_swarm(one)]
+    constants = [one for one in listed if one.robot is not None and _is_constant(one)]
+    mixture = weigh_models(solver, [found], candidates=constants)
+    part = _check_window(mixture, time_s, FALSE_ALARM)
+    if part.fault is None and not mixture.members[0].models:
+        return part
+    mixture = weigh_models(solver, [found], candidates=listed)
+    tried = _check_window(mixture, time_s, MIN_PRIOR_CHANCE)
+    if tried.fault is None or part.fault is None:
+        return tried
+    # Models bend the solution, which hides the sensor that they stand for.
+    return tried._replace(fault=replace(tried.fault, robot=part.fault.robot))
+
+
+def _suits_swarm(one: Candidate) -> bool:
+    """Return whether a model adds no state for each pair of robots: there are too many."""
+    states = [row for row in one.model.rows if not row.is_constant and row.owner == "pair"]
+    return not (states or one.model.sudden or one.model.for_a_while)
+
+
+def _is_constant(one: Candidate) -> bool:
+    """Return whether a model adds constants alone."""
+    return bool(one.model.rows) and all(row.is_constant for row in one.model.rows)
+
+
+def _is_of_time(one: Candidate) -> bool:
+    """Return whether a model is of a clock or of a delay, which moves samples in time."""
+    return any(row.owner == "clock" or row.name in SIGNALS for row in one.model.rows)
+
+
+def _check_window(mixture: Mixture, time_s: Array, least_chance: float) -> SwarmPart:
+    """Return a window with the fault that its models leave.
+
+    Parameters
+    ----------
+    mixture
+        Solutions under likely models.
+    time_s
+        (T,) output times, seconds.
+    least_chance
+        Smallest probability of the constants, by their priors, of a flight that is explained.
+    """
+    best = mixture.members[0]
+    ends = float(time_s[0]), float(time_s[-1])
+    innovations, misfits = check_fit(best.solver, best.values, ends)
+    problem = best.solver.problem
+    fault = max(misfits, key=lambda one: one.to_s - one.from_s, default=None)
+    if fault is not None and fault.robot is None:
+        fault = replace(fault, robot=_find_worst_robot(best))
+    # Only pairs are solved again with samples that are moved in time.
+    moved = next((one for one in best.models if _is_of_time(one)), None)
+    if moved is not None:
+        fault = Cause(moved.model.name, 1.0, *ends, moved.robot)
+    elif fault is None and (
+        problem.noise.grade >= MISFIT_GRADE
+        or compute_prior_chance(problem, best.values) < least_chance
+    ):
+        fault = Cause("priors", 1.0, *ends, _find_worst_robot(best))
+    spread = [compute_covariance(one.solver, one.values) for one in mixture.members]
+    return SwarmPart(WindowSolution(mixture, [] if fault else spread), time_s, innovations, fault)
+
+
+def _find_worst_robot(best: Member) -> int:
+    """Return the robot whose odometry differs most from the solution, relative to its noise."""
+    robots = range(len(best.solver.problem.robots))
+    squares = [sum_velocity_squares(best.solver, best.values, robot).mean() for robot in robots]
+    return int(np.argmax(squares))
 
 
 def _with_pair_models(
@@ -186,8 +265,8 @@ def _with_pair_models(
     return replace(problem, noise=noise, unused=frozenset(unused))
 
 
-def _initial_state(flight: Problem, names: list[str], estimates: Mapping[Names, Estimate]) -> Array:
-    """Return (K, n) states from the pairs' solutions, along the tree of smallest sigmas."""
+def _first_guess(flight: Problem, names: list[str], estimates: Mapping[Names, Estimate]) -> Values:
+    """Return values from the solutions of the pairs, along the tree of smallest sigmas."""
     sigma_m = {
         both: float(np.median(np.linalg.eigvalsh(e.covariance[:, :2, :2])[:, -1]))
         for both, e in estimates.items()
@@ -213,37 +292,4 @@ def _initial_state(flight: Problem, names: list[str], estimates: Mapping[Names, 
         error = estimates[names[link.robots[0]], names[link.robots[1]]]
         if column is not None and error.range_error_m is not None:
             state[:, column] = np.interp(key_s, error.time_s, error.range_error_m)
-    return state
-
-
-def _select_pair(part: Part, both: tuple[int, int]) -> Estimate:
-    """Return the estimate of one ordered pair in a window, without statuses."""
-    solver, values, covariances, time_s = part
-    problem, key_s = solver.problem, solver.problem.keyframe_s
-    spread = covariances.relative(values.state, *both)
-    heights, height_std = height_errors(problem, values, covariances, both)
-    return Estimate(
-        time_s,
-        relative_path(interpolate_states(problem, values.state, time_s), *both),
-        interpolate_at(time_s, key_s, spread),
-        np.zeros(len(time_s), np.int8),
-        _pair_constants(problem.layout, values.constants, both),
-        problem.noise,
-        height_m=interpolate_at(time_s, key_s, heights),
-        height_std_m=interpolate_at(time_s, key_s, height_std),
-    )
-
-
-def _pair_constants(layout: Layout, constants: Array, both: tuple[int, int]) -> Array:
-    """Return (G,) constants of a pair in the order of ``PAIR_LAYOUT``; 0 without an estimate."""
-    known = {subject: constants[k] for k, (subject, _) in enumerate(layout.constants)}
-    out = np.zeros(len(PAIR_LAYOUT.constants))
-    for k, ((name, own), row) in enumerate(PAIR_LAYOUT.constants):
-        if row.owner == "clock":
-            # The first robot's clock counts, and has no column.
-            here, there = (known.get((name, (robot,)), 0.0) for robot in both)
-            out[k] = there - here
-        else:
-            owners = tuple(sorted(both[side] for side in own))
-            out[k] = known.get((name, owners), 0.0)
-    return out
+    return Values(state, np.zeros(len(layout.constants)))

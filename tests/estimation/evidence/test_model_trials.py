@@ -144,6 +144,6 @@ def test_velocity_errors_count_coloured_noise_of_their_robot_alone() -> None:
     values = Values(state, np.zeros(len(layout.constants)))
     motions = [one for one in solver.linearize(values) if isinstance(one, Rows) and one.steps]
     for robot, steps in ((0, [49, 50]), (1, [])):
-        coloured = noisy_stretch._velocity_squares(solver, values, robot)
+        coloured = noisy_stretch.sum_velocity_squares(solver, values, robot)
         coloured -= motions[robot].square[:, :2].sum(axis=1)
         assert np.flatnonzero(coloured > 1).tolist() == steps

@@ -8,7 +8,7 @@ from dmrl import messages
 from dmrl.estimation.evidence.model_trials import Member
 from dmrl.estimation.evidence.posterior import Mixture
 from dmrl.estimation.flight.pair_output import SIGMA_FACTOR, mix_members
-from dmrl.estimation.flight.pair_solver import PairSolution
+from dmrl.estimation.flight.pair_solver import WindowSolution
 from dmrl.estimation.flight.pairs import estimate_ekf, estimate_pairs
 from dmrl.estimation.model import status as room
 from dmrl.estimation.model.odometry import Odometry
@@ -72,7 +72,7 @@ def test_covariance_includes_distance_between_modes() -> None:
         Member(Solver(still), MapEstimate(Values(s, np.zeros(0)), 7.0), 0.0) for s in (state, other)
     ]
     spread = Covariances(np.zeros((count, width, width)), np.zeros((0, 0)), state)
-    found = PairSolution(Mixture(members, np.array([0.5, 0.5])), [spread, spread])
+    found = WindowSolution(Mixture(members, np.array([0.5, 0.5])), [spread, spread])
     mean, covariance = mix_members(found, problem.keyframe_s[:3])
     assert mean == pytest.approx(np.tile([2.5, 0.0, 0.0], (3, 1)))
     assert covariance == pytest.approx(

@@ -1,5 +1,6 @@
 """Joint solve of all robots: as accurate and consistent as pairwise solves."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from itertools import combinations
@@ -9,8 +10,8 @@ import pytest
 
 from dmrl.estimation.flight import windows
 from dmrl.estimation.flight.pairs import estimate_ekf, estimate_pairs
-from dmrl.estimation.flight.swarm import estimate_swarm, is_inconsistent
-from dmrl.estimation.model.pair import Pair, SensorTrack
+from dmrl.estimation.flight.swarm import estimate_swarm
+from dmrl.estimation.model.pair import Array, Pair, SensorTrack
 from dmrl.estimation.model.status import AMBIGUOUS, OK
 from dmrl.estimation.solver.estimate import Estimate, seen_from_peer
 from dmrl.flight import NOISE, Fault, Flight, Scenario, Trajectory, simulate
@@ -34,10 +35,30 @@ def solved(
 ) -> tuple[Flight, dict[Names, Pair], Estimates, Estimates]:
     flight = simulate(Scenario(robots, duration_s, trajectory), NOISE[noise], 1, faults)
     pairs = {names: pair_of(flight, *names) for names in combinations(flight.robots, 2)}
-    both: Estimates = {}
-    for names, (here, there) in zip(pairs, estimate_pairs(list(pairs.values())), strict=True):
-        both |= {names: here, names[::-1]: there}
+    both = solve_pairs(pairs)
     return flight, pairs, both, estimate_swarm(pairs, both)
+
+
+def solve_pairs(pairs: dict[Names, Pair], *, plain: bool = True) -> Estimates:
+    """Return the estimates of both directions of some pairs."""
+    out: Estimates = {}
+    for names, (here, there) in zip(
+        pairs, estimate_pairs(list(pairs.values()), plain=plain), strict=True
+    ):
+        out |= {names: here, names[::-1]: there}
+    return out
+
+
+def change_robot(
+    pairs: dict[Names, Pair], robot: str, change: Callable[[SensorTrack, Array], SensorTrack]
+) -> dict[Names, Pair]:
+    """Return the pairs with another log of a robot; `change` gets the log and its (N,) times."""
+    out = dict(pairs)
+    for names, pair in pairs.items():
+        if robot in names:
+            side = ("own", "peer")[names.index(robot)]
+            out[names] = replace(pair, **{side: change(getattr(pair, side), pair.time_s)})
+    return out
 
 
 def errors(flight: Flight, estimates: Estimates) -> np.ndarray:
@@ -93,12 +114,12 @@ def test_static_observer_has_ambiguous_bearings() -> None:
         assert (swarm["cf1", peer].status == AMBIGUOUS).mean() > 0.9
 
 
-def test_swarm_solve_leaves_a_single_pair_unchanged() -> None:
+def test_swarm_solve_leaves_out_a_single_pair() -> None:
     names = ("cf1", "cf2")
     pair = pair_of(simulate(Scenario(2, 10.0), NOISE["realistic"], 1))
     (estimate,) = estimate_ekf([pair], "published-sim")
     alone = {names: estimate, names[::-1]: seen_from_peer(estimate)}
-    assert estimate_swarm({names: pair}, alone) == alone
+    assert estimate_swarm({names: pair}, alone) == {}
 
 
 def test_shadowed_ranges_of_one_pair_do_not_bend_the_others() -> None:
@@ -109,18 +130,47 @@ def test_shadowed_ranges_of_one_pair_do_not_bend_the_others() -> None:
     kept = np.concatenate([e.status == OK for e in swarm.values()])
     assert kept.mean() > 0.5
     assert (error[kept] > 0.3).mean() < 0.02
-    # Without the unknown of the range error the joint solve is worse.
+    # Without the unknown of the range error the joint solve does not fit.
     blind = {names: replace(e, range_error_m=None) for names, e in both.items()}
-    without = errors(flight, estimate_swarm(pairs, blind))
-    assert np.sqrt((error**2).mean()) < np.sqrt((without**2).mean())
+    assert estimate_swarm(pairs, blind) == {}
 
 
-def test_swarm_estimate_inconsistent_with_pair_is_detected() -> None:
-    *_, pairwise, swarm = solved("in_view", "calibrated")
-    names = ("cf1", "cf2")
-    assert not is_inconsistent(swarm[names], pairwise[names])
-    bent = replace(swarm[names], state=swarm[names].state + np.array([0.5, 0.0, 0.0]))
-    assert is_inconsistent(bent, pairwise[names])
+def test_a_gyroscope_that_drifts_is_identified_in_a_swarm() -> None:
+    flight, pairs, *_ = solved("random", "calibrated", 4)
+    drift = change_robot(
+        pairs,
+        "cf3",
+        lambda track, time_s: replace(
+            track, yaw_rate_radps=track.yaw_rate_radps + 0.1 * time_s / time_s[-1]
+        ),
+    )
+    swarm = estimate_swarm(drift, solve_pairs(drift))
+    for names, estimate in swarm.items():
+        found = [cause.name for cause in estimate.causes if cause.robot is not None]
+        assert found == ["yaw rate bias changes"] * ("cf3" in names)
+    kept = np.concatenate([estimate.status == OK for estimate in swarm.values()])
+    assert len(swarm) == 12 and kept.mean() > 0.9
+    assert (errors(flight, swarm)[kept] > 0.3).mean() < 0.05  # 0.09 without the model
+
+
+def test_a_robot_that_no_model_explains_is_left_out() -> None:
+    flight, pairs, *_ = solved("random", "calibrated", 4)
+    negated = change_robot(
+        pairs, "cf3", lambda track, _: replace(track, yaw_rate_radps=-track.yaw_rate_radps)
+    )
+    swarm = estimate_swarm(negated, solve_pairs(negated))
+    assert {name for names in swarm for name in names} == {"cf1", "cf2", "cf4"}
+    kept = np.concatenate([estimate.status == OK for estimate in swarm.values()])
+    assert kept.mean() > 0.9
+    assert (errors(flight, swarm)[kept] > 0.3).mean() < 0.02
+
+
+def test_a_robot_that_flies_for_a_shorter_time_is_left_out() -> None:
+    _, pairs, *_ = solved("random", "calibrated", 4)
+    landed = {n: pair.crop(0.0, 25.0) if "cf2" in n else pair for n, pair in pairs.items()}
+    swarm = estimate_swarm(landed, solve_pairs(landed))
+    assert {name for names in swarm for name in names} == {"cf1", "cf3", "cf4"}
+    assert min(estimate.time_s[-1] for estimate in swarm.values()) > 39.0
 
 
 def test_clock_offset_is_estimated_in_a_swarm() -> None:
@@ -128,20 +178,13 @@ def test_clock_offset_is_estimated_in_a_swarm() -> None:
     flight = simulate(Scenario(3, 40.0, "random"), NOISE["calibrated"], 1)
     pairs = {names: pair_of(flight, *names) for names in combinations(flight.robots, 2)}
 
-    def delay(pair: Pair, side: str) -> Pair:
-        """Return the pair with one robot's log stamped late."""
-        track = getattr(pair, side)
-        signals = [np.interp(pair.time_s - late_s, pair.time_s, s) for s in track.signals()]
-        return replace(pair, **{side: SensorTrack(*signals, track.dropout)})
+    def delay(track: SensorTrack, time_s: Array) -> SensorTrack:
+        """Return a log that is stamped late."""
+        signals = [np.interp(time_s - late_s, time_s, s) for s in track.signals()]
+        return SensorTrack(*signals, track.dropout)
 
-    shifted = {
-        (one, other): delay(pair, "peer") if other == "cf3" else pair
-        for (one, other), pair in pairs.items()
-    }
-    both: Estimates = {}
-    for names, (here, there) in zip(shifted, estimate_pairs(list(shifted.values())), strict=True):
-        both |= {names: here, names[::-1]: there}
-    swarm = estimate_swarm(shifted, both)
+    shifted = change_robot(pairs, "cf3", delay)
+    swarm = estimate_swarm(shifted, solve_pairs(shifted))
     assert swarm["cf1", "cf3"].value("clock", 1) == pytest.approx(late_s, abs=0.02)
     assert swarm["cf3", "cf1"].value("clock", 1) == pytest.approx(-late_s, abs=0.02)
     assert swarm["cf1", "cf2"].value("clock", 1) == pytest.approx(0.0, abs=0.02)
