@@ -52,7 +52,3 @@ def compute_truth(flight: Flight, time_s: Array, own: str = "cf1", peer: str = "
     """Return (N, 2) true positions of the peer, horizontal frame of the observer, on its clock."""
     true_s = flight.clocks[own].to_true_time(time_s)
     return flight.peer_in_horizontal(own, peer, true_s)[:, :2]
-
-
-# test_pairs and test_swarm import these names.
-flown, pair_of, truth_at = simulate_flight, build_pair, compute_truth

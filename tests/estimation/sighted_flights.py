@@ -69,7 +69,3 @@ def build_still_pair(bearing_rad: float = 0.0) -> tuple[Pair, Array]:
     ranges_s = np.arange(0.05, 10, 0.05)
     where = 2.0 * np.array([np.cos(bearing_rad), np.sin(bearing_rad)])
     return Pair(time_s, still, still, ranges_s, np.full(len(ranges_s), 2.0)), where
-
-
-# test_swarm imports these names.
-rmse, sightings = compute_rmse, simulate_bearings

@@ -6,7 +6,7 @@ one row. Names begin with the signal, since `dmrl check` and `view` print them a
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -123,16 +123,12 @@ def _shift_only(effect: Array) -> Array:
 
 def _later_turn(steps: "Steps") -> Array:
     """Return the effect of a late yaw rate."""
-    out = later(steps)
-    out[:, :2] = 0.0
-    return out
+    return np.asarray(later(steps) * [0.0, 0.0, 1.0])
 
 
 def _later_flow(steps: "Steps") -> Array:
     """Return the effect of late velocities."""
-    out = later(steps)
-    out[:, 2] = 0.0
-    return out
+    return np.asarray(later(steps) * [1.0, 1.0, 0.0])
 
 
 def _scale_shift(steps: "Steps") -> Array:
@@ -197,22 +193,13 @@ def _harmonic(order: int, phase_rad: float) -> "Callable[[RangeLink, Sight], Arr
     return effect
 
 
-def _constant(name: str, unit: str, std: float, **effect: object) -> Unknown:
-    return Unknown(name, unit, std, "robot", **effect)  # type: ignore[arg-type]
+def _constant(name: str, unit: str, std: float, **effect: Any) -> Unknown:
+    return Unknown(name, unit, std, "robot", **effect)
 
 
-def _changing(name: str, unit: str, std: float, start: float, **effect: object) -> Unknown:
+def _changing(name: str, unit: str, std: float, start: float, **effect: Any) -> Unknown:
     """Return an unknown that walks, with steps that may be large."""
-    return Unknown(
-        name,
-        unit,
-        std,
-        "robot",
-        Cauchy(2.0),
-        "jump",
-        start_std=start,
-        **effect,  # type: ignore[arg-type]
-    )
+    return Unknown(name, unit, std, "robot", Cauchy(2.0), "jump", start_std=start, **effect)
 
 
 MODELS: tuple[ErrorModel, ...] = (

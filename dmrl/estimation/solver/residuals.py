@@ -226,8 +226,7 @@ def range_factor(problem: Problem, layout: Layout, link: RangeLink, values: Valu
         value = values.constants[c] if constant else values.state[padded.keyframe, c]
         if row.height:
             heights.append((column, side * row.height))
-            continue
-        if row.range_power:
+        elif row.range_power:
             out[column] = distance**row.range_power
             gain += row.range_power * value * distance ** (row.range_power - 1)
         elif row.range:

@@ -28,7 +28,7 @@ from dmrl.estimation.solver.problem import NoiseModel
 from dmrl.estimation.solver.residuals import Values
 from dmrl.flight import Trajectory
 
-from ..flights import flown, pair_of, truth_at
+from ..flights import build_pair, compute_truth, simulate_flight
 
 LONG_S = 60.0
 Both = tuple[Estimate, Estimate]
@@ -37,11 +37,11 @@ Both = tuple[Estimate, Estimate]
 @cache
 def solved(trajectory: Trajectory, noise: str, seed: int) -> Both:
     """What a minute's flight of one pair is estimated to be: once, for every test that asks."""
-    (found,) = estimate_pairs([pair_of(flown(trajectory, noise, seed, LONG_S))])
+    (found,) = estimate_pairs([build_pair(simulate_flight(trajectory, noise, seed, LONG_S))])
     return found
 
 
-def rmse(
+def compute_rmse(
     estimate: Estimate,
     seed: int,
     noise: str = "calibrated",
@@ -49,16 +49,18 @@ def rmse(
     *,
     duration_s: float = LONG_S,
 ) -> float:
-    flight = flown("in_view", noise, seed, duration_s)
+    flight = simulate_flight("in_view", noise, seed, duration_s)
     peer = "cf2" if own == "cf1" else "cf1"
-    error = estimate.state[:, :2] - truth_at(flight, estimate.time_s, own, peer)
+    error = estimate.state[:, :2] - compute_truth(flight, estimate.time_s, own, peer)
     settled = estimate.time_s - estimate.time_s[0] > 20
     return float(np.sqrt((error[settled] ** 2).sum(axis=1).mean()))
 
 
 def test_covariance_includes_distance_between_modes() -> None:
     """Two solutions of one weight, 1 m apart."""
-    problem = build_problem({(0, 1): pair_of(flown("in_view", "calibrated", 1000, 20.0))})
+    problem = build_problem(
+        {(0, 1): build_pair(simulate_flight("in_view", "calibrated", 1000, 20.0))}
+    )
     count, width = len(problem.keyframe_s), problem.layout.width
     state = np.zeros((count, width))
     state[:, 3] = 2.0
@@ -103,11 +105,11 @@ def test_statuses_equal_the_schema() -> None:
 @pytest.mark.heavy
 def test_batch_solve_is_more_accurate_than_the_published_filter() -> None:
     seeds = (1000, 1001, 1002, 1003)
-    pairs = [pair_of(flown("in_view", "calibrated", seed, LONG_S)) for seed in seeds]
+    pairs = [build_pair(simulate_flight("in_view", "calibrated", seed, LONG_S)) for seed in seeds]
     published = [
-        rmse(e, s) for e, s in zip(estimate_ekf(pairs, "published-sim"), seeds, strict=True)
+        compute_rmse(e, s) for e, s in zip(estimate_ekf(pairs, "published-sim"), seeds, strict=True)
     ]
-    batch = [rmse(solved("in_view", "calibrated", s)[0], s) for s in seeds]
+    batch = [compute_rmse(solved("in_view", "calibrated", s)[0], s) for s in seeds]
     assert np.median(batch) < np.median(published)
     assert max(batch) < 0.35
 
@@ -123,7 +125,7 @@ def test_noise_scale_orders_calibrated_realistic_and_harsh_sensors() -> None:
 @pytest.mark.heavy
 def test_both_directions_are_transforms_of_one_solve() -> None:
     here, there = solved("in_view", "calibrated", 1001)
-    assert rmse(there, 1001, own="cf2") < 0.35
+    assert compute_rmse(there, 1001, own="cf2") < 0.35
     assert np.allclose(transform_to_peer(there.state), here.state)
     again = seen_from_peer(seen_from_peer(here))
     assert np.allclose(again.covariance, here.covariance)
@@ -162,7 +164,7 @@ def test_unobservable_bearing_is_ambiguous_in_other_flights(
 
 @pytest.mark.heavy
 def test_no_position_is_ok_during_sensor_dropout() -> None:
-    pair = pair_of(flown("random", "calibrated", 1001, LONG_S))
+    pair = build_pair(simulate_flight("random", "calibrated", 1001, LONG_S))
     gap = (pair.time_s > 30) & (pair.time_s < 33)
     held = SensorTrack(*(np.where(gap, 0.0, signal) for signal in pair.own.signals()), gap)
     ((estimate, _),) = estimate_pairs(
@@ -175,7 +177,7 @@ def test_no_position_is_ok_during_sensor_dropout() -> None:
 
 @pytest.mark.heavy
 def test_no_position_is_ok_during_range_dropout_and_distance_stays_bounded() -> None:
-    pair = pair_of(flown("random", "calibrated", 1000, LONG_S))
+    pair = build_pair(simulate_flight("random", "calibrated", 1000, LONG_S))
     kept = (pair.range_time_s < 30) | (pair.range_time_s > 33)
     range_time_s, range_m = pair.range_time_s[kept], pair.range_m[kept]
     ((estimate, _),) = estimate_pairs([replace(pair, range_time_s=range_time_s, range_m=range_m)])
@@ -190,7 +192,7 @@ def test_no_position_is_ok_during_range_dropout_and_distance_stays_bounded() -> 
 def test_solve_is_robust_to_range_and_gyro_faults(fault: str) -> None:
     # A minute does not tell an offset of the ranges well enough to keep anything.
     duration_s = 100.0 if fault == "offset" else LONG_S
-    pair = pair_of(flown("in_view", "calibrated", 1002, duration_s))
+    pair = build_pair(simulate_flight("in_view", "calibrated", 1002, duration_s))
     if fault in ("shadowed", "offset"):
         burst = (pair.range_time_s > 30) & (pair.range_time_s < 33)
         longer = 0.35 if fault == "offset" else 1.0 * burst
@@ -201,13 +203,13 @@ def test_solve_is_robust_to_range_and_gyro_faults(fault: str) -> None:
         biased = replace(log, yaw_rate_radps=log.yaw_rate_radps + 0.05)
         pair = replace(pair, **{side: biased})
     ((estimate, _),) = estimate_pairs([pair])
-    assert rmse(estimate, 1002, duration_s=duration_s) < 0.16
+    assert compute_rmse(estimate, 1002, duration_s=duration_s) < 0.16
     assert (estimate.status == room.OK).mean() > 0.5
 
 
 @pytest.mark.heavy
 def test_a_flight_without_ranges_is_ambiguous() -> None:
-    pair = pair_of(flown("in_view", "calibrated", 1000, 20.0))
+    pair = build_pair(simulate_flight("in_view", "calibrated", 1000, 20.0))
     none = Pair(pair.time_s, pair.own, pair.peer, np.zeros(0), np.zeros(0))
     ((estimate, _),) = estimate_pairs([none])
     assert (estimate.status == room.AMBIGUOUS).all()
@@ -215,7 +217,9 @@ def test_a_flight_without_ranges_is_ambiguous() -> None:
 
 @pytest.mark.heavy
 def test_pairs_of_different_length_equal_separate_estimates() -> None:
-    pairs = [pair_of(flown("in_view", "calibrated", 1000 + k, 4.0 + k)) for k in range(2)]
+    pairs = [
+        build_pair(simulate_flight("in_view", "calibrated", 1000 + k, 4.0 + k)) for k in range(2)
+    ]
     together = estimate_pairs(pairs)
     for pair, (estimate, _) in zip(pairs, together, strict=True):
         ((alone, _),) = estimate_pairs([pair])

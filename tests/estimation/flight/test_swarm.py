@@ -16,8 +16,8 @@ from dmrl.estimation.model.status import AMBIGUOUS, OK
 from dmrl.estimation.solver.estimate import Estimate, seen_from_peer
 from dmrl.flight import NOISE, Fault, Flight, Scenario, Trajectory, simulate
 
-from ..flights import pair_of, truth_at
-from ..sighted_flights import rmse, sightings
+from ..flights import build_pair, compute_truth
+from ..sighted_flights import compute_rmse, simulate_bearings
 
 pytestmark = pytest.mark.heavy
 
@@ -34,7 +34,7 @@ def solved(
     duration_s: float = 40.0,
 ) -> tuple[Flight, dict[Names, Pair], Estimates, Estimates]:
     flight = simulate(Scenario(robots, duration_s, trajectory), NOISE[noise], 1, faults)
-    pairs = {names: pair_of(flight, *names) for names in combinations(flight.robots, 2)}
+    pairs = {names: build_pair(flight, *names) for names in combinations(flight.robots, 2)}
     both = solve_pairs(pairs)
     return flight, pairs, both, estimate_swarm(pairs, both)
 
@@ -65,7 +65,7 @@ def errors(flight: Flight, estimates: Estimates) -> np.ndarray:
     """Horizontal errors of every ordered pair, metres."""
     return np.concatenate(
         [
-            np.linalg.norm(e.state[:, :2] - truth_at(flight, e.time_s, *names), axis=1)
+            np.linalg.norm(e.state[:, :2] - compute_truth(flight, e.time_s, *names), axis=1)
             for names, e in estimates.items()
         ]
     )
@@ -84,7 +84,7 @@ def test_swarm_covariances_cover_truth_and_ok_positions_are_accurate() -> None:
     flight, _, _, swarm = solved("random", "realistic")
     inside, bad, kept = [], 0, 0
     for names, e in swarm.items():
-        error = e.state[:, :2] - truth_at(flight, e.time_s, *names)
+        error = e.state[:, :2] - compute_truth(flight, e.time_s, *names)
         squared = np.einsum("ki,kij,kj->k", error, np.linalg.inv(e.covariance[:, :2, :2]), error)
         inside.append((squared < 5.991).mean())
         bad += int((np.linalg.norm(error, axis=1)[e.status == OK] > 0.3).sum())
@@ -116,7 +116,7 @@ def test_static_observer_has_ambiguous_bearings() -> None:
 
 def test_swarm_solve_leaves_out_a_single_pair() -> None:
     names = ("cf1", "cf2")
-    pair = pair_of(simulate(Scenario(2, 10.0), NOISE["realistic"], 1))
+    pair = build_pair(simulate(Scenario(2, 10.0), NOISE["realistic"], 1))
     (estimate,) = estimate_ekf([pair], "published-sim")
     alone = {names: estimate, names[::-1]: seen_from_peer(estimate)}
     assert estimate_swarm({names: pair}, alone) == {}
@@ -176,7 +176,7 @@ def test_a_robot_that_flies_for_a_shorter_time_is_left_out() -> None:
 def test_clock_offset_is_estimated_in_a_swarm() -> None:
     late_s = 0.06
     flight = simulate(Scenario(3, 40.0, "random"), NOISE["calibrated"], 1)
-    pairs = {names: pair_of(flight, *names) for names in combinations(flight.robots, 2)}
+    pairs = {names: build_pair(flight, *names) for names in combinations(flight.robots, 2)}
 
     def delay(track: SensorTrack, time_s: Array) -> SensorTrack:
         """Return a log that is stamped late."""
@@ -193,7 +193,7 @@ def test_clock_offset_is_estimated_in_a_swarm() -> None:
 
 def test_detections_improve_a_swarm_solve() -> None:
     flight, pairs, both, swarm = solved("in_view", "calibrated")
-    sees = sightings(flight, "cf1", ("cf2",))
+    sees = simulate_bearings(flight, "cf1", ("cf2",))
     looking = {
         names: replace(pair, own_bearings=sees) if names == ("cf1", "cf2") else pair
         for names, pair in pairs.items()
@@ -201,7 +201,7 @@ def test_detections_improve_a_swarm_solve() -> None:
     seen = estimate_swarm(looking, both)
     names = ("cf1", "cf2")
     error = [
-        rmse(found[names].state[:, :2], truth_at(flight, found[names].time_s, *names))
+        compute_rmse(found[names].state[:, :2], compute_truth(flight, found[names].time_s, *names))
         for found in (swarm, seen)
     ]
     assert error[1] < 0.7 * error[0]
