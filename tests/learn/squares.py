@@ -1,6 +1,7 @@
 """Images of bright squares, and augmentations of them."""
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dmrl.learn.data.augment import Augmentation, Augmenter
 from dmrl.learn.data.batches import ROBOT_FIELDS, Batch, ExampleSet
@@ -40,3 +41,20 @@ def build_augmenter(**settings: object) -> Augmenter:
     examples = draw_squares(2)
     examples.robots[:, 0, 2] = 1.0, 4.0
     return Augmenter(examples, Augmentation(**settings), seed=0)  # type: ignore[arg-type]
+
+
+def select_single_robots(batch: Batch) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
+    """Return (first channel (112, 160), robot) of images with one whole robot.
+
+    The robot must be at least one and a half times its half side from the edge.
+    """
+    out = []
+    for image, robots in zip(batch.images.numpy(), batch.robots.numpy(), strict=True):
+        found = robots[np.isfinite(robots[:, 0])].astype(np.float64)
+        if len(found) != 1:
+            continue
+        half = SIDE_M / found[0, 2]
+        margin = np.array([[found[0, 0], 160 - found[0, 0]], [found[0, 1], 112 - found[0, 1]]])
+        if (margin > 1.5 * half).all():
+            out.append((image[0].astype(np.float64), found[0]))
+    return out

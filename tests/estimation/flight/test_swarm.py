@@ -26,25 +26,25 @@ Estimates = dict[Names, Estimate]
 
 
 @cache
-def solved(
+def solve_flight(
     trajectory: Trajectory,
     noise: str,
     robots: int = 3,
     faults: tuple[Fault, ...] = (),
     duration_s: float = 40.0,
 ) -> tuple[Flight, dict[Names, Pair], Estimates, Estimates]:
+    """Return a flight, its pairs, and their estimates by pairs and together."""
     flight = simulate(Scenario(robots, duration_s, trajectory), NOISE[noise], 1, faults)
     pairs = {names: build_pair(flight, *names) for names in combinations(flight.robots, 2)}
     both = solve_pairs(pairs)
     return flight, pairs, both, estimate_swarm(pairs, both)
 
 
-def solve_pairs(pairs: dict[Names, Pair], *, plain: bool = True) -> Estimates:
-    """Return the estimates of both directions of some pairs."""
+def solve_pairs(pairs: dict[Names, Pair]) -> Estimates:
+    """Return the estimates of both directions of some pairs, under the plain model."""
     out: Estimates = {}
-    for names, (here, there) in zip(
-        pairs, estimate_pairs(list(pairs.values()), plain=plain), strict=True
-    ):
+    estimates = estimate_pairs(list(pairs.values()), plain=True)
+    for names, (here, there) in zip(pairs, estimates, strict=True):
         out |= {names: here, names[::-1]: there}
     return out
 
@@ -61,8 +61,8 @@ def change_robot(
     return out
 
 
-def errors(flight: Flight, estimates: Estimates) -> np.ndarray:
-    """Horizontal errors of every ordered pair, metres."""
+def compute_errors(flight: Flight, estimates: Estimates) -> np.ndarray:
+    """Return the horizontal errors of every ordered pair, metres."""
     return np.concatenate(
         [
             np.linalg.norm(e.state[:, :2] - compute_truth(flight, e.time_s, *names), axis=1)
@@ -74,14 +74,14 @@ def errors(flight: Flight, estimates: Estimates) -> np.ndarray:
 @pytest.mark.parametrize(("noise", "share"), [("calibrated", 1.0), ("realistic", 1.02)])
 def test_swarm_solve_is_as_accurate_as_pairwise_solves(noise: str, share: float) -> None:
     """With little noise nearer; else, where a sure pair contradicts, they are the pairs' own."""
-    flight, _, pairwise, swarm = solved("in_view", noise)
+    flight, _, pairwise, swarm = solve_flight("in_view", noise)
     assert set(swarm) == set(pairwise)
-    one, other = (np.sqrt(np.mean(errors(flight, e) ** 2)) for e in (pairwise, swarm))
+    one, other = (np.sqrt(np.mean(compute_errors(flight, e) ** 2)) for e in (pairwise, swarm))
     assert other < share * one
 
 
 def test_swarm_covariances_cover_truth_and_ok_positions_are_accurate() -> None:
-    flight, _, _, swarm = solved("random", "realistic")
+    flight, _, _, swarm = solve_flight("random", "realistic")
     inside, bad, kept = [], 0, 0
     for names, e in swarm.items():
         error = e.state[:, :2] - compute_truth(flight, e.time_s, *names)
@@ -94,7 +94,7 @@ def test_swarm_covariances_cover_truth_and_ok_positions_are_accurate() -> None:
 
 
 def test_swarm_positions_are_consistent_around_a_triangle() -> None:
-    *_, swarm = solved("random", "realistic")
+    *_, swarm = solve_flight("random", "realistic")
     one, two, three = (swarm[n].state for n in (("cf1", "cf2"), ("cf2", "cf3"), ("cf1", "cf3")))
     turn = np.exp(1j * one[:, 2])
     around = one[:, 0] + 1j * one[:, 1] + turn * (two[:, 0] + 1j * two[:, 1])
@@ -103,13 +103,13 @@ def test_swarm_positions_are_consistent_around_a_triangle() -> None:
 
 @pytest.mark.parametrize("trajectory", ["parallel", "hover"])
 def test_unobservable_swarm_motion_has_no_ok_positions(trajectory: Trajectory) -> None:
-    *_, swarm = solved(trajectory, "calibrated", duration_s=20.0)
+    *_, swarm = solve_flight(trajectory, "calibrated", duration_s=20.0)
     for estimate in swarm.values():
         assert not (estimate.status == OK).any()
 
 
 def test_static_observer_has_ambiguous_bearings() -> None:
-    *_, swarm = solved("observer_static", "calibrated", duration_s=20.0)
+    *_, swarm = solve_flight("observer_static", "calibrated", duration_s=20.0)
     for peer in ("cf2", "cf3"):
         assert (swarm["cf1", peer].status == AMBIGUOUS).mean() > 0.9
 
@@ -125,8 +125,8 @@ def test_swarm_solve_leaves_out_a_single_pair() -> None:
 def test_shadowed_ranges_of_one_pair_do_not_bend_the_others() -> None:
     # Ranges 1 m too long for 3 s, twice: taken as they are, all three robots were 0.3 m off.
     shadow = Fault("nlos", "cf1", "cf2", size=1.0, duration_s=3.0, number=2)
-    flight, pairs, both, swarm = solved("in_view", "calibrated", 3, (shadow,))
-    error = errors(flight, swarm)
+    flight, pairs, both, swarm = solve_flight("in_view", "calibrated", 3, (shadow,))
+    error = compute_errors(flight, swarm)
     kept = np.concatenate([e.status == OK for e in swarm.values()])
     assert kept.mean() > 0.5
     assert (error[kept] > 0.3).mean() < 0.02
@@ -136,7 +136,7 @@ def test_shadowed_ranges_of_one_pair_do_not_bend_the_others() -> None:
 
 
 def test_a_gyroscope_that_drifts_is_identified_in_a_swarm() -> None:
-    flight, pairs, *_ = solved("random", "calibrated", 4)
+    flight, pairs, *_ = solve_flight("random", "calibrated", 4)
     drift = change_robot(
         pairs,
         "cf3",
@@ -150,11 +150,11 @@ def test_a_gyroscope_that_drifts_is_identified_in_a_swarm() -> None:
         assert found == ["yaw rate bias changes"] * ("cf3" in names)
     kept = np.concatenate([estimate.status == OK for estimate in swarm.values()])
     assert len(swarm) == 12 and kept.mean() > 0.9
-    assert (errors(flight, swarm)[kept] > 0.3).mean() < 0.05  # 0.09 without the model
+    assert (compute_errors(flight, swarm)[kept] > 0.3).mean() < 0.05  # 0.09 without the model
 
 
 def test_a_robot_that_no_model_explains_is_left_out() -> None:
-    flight, pairs, *_ = solved("random", "calibrated", 4)
+    flight, pairs, *_ = solve_flight("random", "calibrated", 4)
     negated = change_robot(
         pairs, "cf3", lambda track, _: replace(track, yaw_rate_radps=-track.yaw_rate_radps)
     )
@@ -162,11 +162,11 @@ def test_a_robot_that_no_model_explains_is_left_out() -> None:
     assert {name for names in swarm for name in names} == {"cf1", "cf2", "cf4"}
     kept = np.concatenate([estimate.status == OK for estimate in swarm.values()])
     assert kept.mean() > 0.9
-    assert (errors(flight, swarm)[kept] > 0.3).mean() < 0.02
+    assert (compute_errors(flight, swarm)[kept] > 0.3).mean() < 0.02
 
 
 def test_a_robot_that_flies_for_a_shorter_time_is_left_out() -> None:
-    _, pairs, *_ = solved("random", "calibrated", 4)
+    _, pairs, *_ = solve_flight("random", "calibrated", 4)
     landed = {n: pair.crop(0.0, 25.0) if "cf2" in n else pair for n, pair in pairs.items()}
     swarm = estimate_swarm(landed, solve_pairs(landed))
     assert {name for names in swarm for name in names} == {"cf1", "cf3", "cf4"}
@@ -192,7 +192,7 @@ def test_clock_offset_is_estimated_in_a_swarm() -> None:
 
 
 def test_detections_improve_a_swarm_solve() -> None:
-    flight, pairs, both, swarm = solved("in_view", "calibrated")
+    flight, pairs, both, swarm = solve_flight("in_view", "calibrated")
     sees = simulate_bearings(flight, "cf1", ("cf2",))
     looking = {
         names: replace(pair, own_bearings=sees) if names == ("cf1", "cf2") else pair
@@ -208,11 +208,11 @@ def test_detections_improve_a_swarm_solve() -> None:
 
 
 def test_a_long_swarm_is_solved_in_windows(monkeypatch: pytest.MonkeyPatch) -> None:
-    flight, pairs, both, whole = solved("random", "calibrated")
+    flight, pairs, both, whole = solve_flight("random", "calibrated")
     monkeypatch.setattr(windows, "WINDOW_S", 16.0)
     monkeypatch.setattr(windows, "OVERLAP_S", 6.0)
     parts = estimate_swarm(pairs, both)
     names = ("cf1", "cf2")
     assert parts[names].time_s == pytest.approx(whole[names].time_s)
-    rms = [float(np.sqrt((errors(flight, e) ** 2).mean())) for e in (whole, parts)]
+    rms = [float(np.sqrt((compute_errors(flight, e) ** 2).mean())) for e in (whole, parts)]
     assert rms[1] < 1.5 * rms[0] + 0.02

@@ -89,10 +89,7 @@ def build_flight() -> tuple[Problem, Values]:
 def perturb(values: Values, seed: int = 0) -> Values:
     """Return values with random errors of 0.01."""
     rng = np.random.default_rng(seed)
-    return Values(
-        values.state + 0.01 * rng.standard_normal(values.state.shape),
-        values.constants + 0.01 * rng.standard_normal(values.constants.shape),
-    )
+    return Values(*(part + 0.01 * rng.standard_normal(part.shape) for part in values))
 
 
 def check_jacobian(make: Callable[[Values], Rows], values: Values) -> None:
@@ -191,7 +188,7 @@ def test_range_error_that_follows_distance_has_an_exact_jacobian() -> None:
     problem, values = build_flight()
     bend = Unknown("bend", "1/m", 0.03, "pair", range_power=2)
     bent = replace(problem, table=(*problem.table, bend))
-    at = perturb(Values(values.state, np.append(values.constants, -0.05)))
+    at = perturb(values._replace(constants=np.append(values.constants, -0.05)))
     check_jacobian(lambda v: range_factor(bent, bent.layout, bent.links[0], v), at)
 
 

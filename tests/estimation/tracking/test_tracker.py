@@ -35,8 +35,7 @@ from .drawn_peers import (
 def test_a_peer_is_followed_through_misses_and_false_alarms() -> None:
     run = run_tracker(1, np.array([[1.5, 0.0, 0.0]]), steps=150)
     assert len(run.ids) > 100
-    longest = max(run.ids.count(number) for number in set(run.ids))
-    assert longest > 0.4 * len(run.ids)
+    assert max(run.ids.count(number) for number in set(run.ids)) > 0.4 * len(run.ids)
     assert np.sqrt(np.mean(run.track_m2)) < 0.4
 
 
