@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, Literal
 
 from dmrl.estimation.flight.data_association import resolve_conflicts
@@ -82,7 +83,8 @@ def estimate_all(
     together = {}
     if solver.method == "swarm" and (connected := select_connected(pairs)):
         starts = _estimate(connected, replace(solver, plain=True), workers, spread)
-        together = estimate_swarm(connected, starts, gate=solver.gate)
+        progress = partial(track, what="Solving together")
+        together = estimate_swarm(connected, starts, gate=solver.gate, progress=progress)
     alone = {names: pair for names, pair in pairs.items() if names not in together}
     estimates = together | _estimate(alone, solver, workers, spread)
     if again := resolve_conflicts(pairs, estimates):

@@ -199,7 +199,8 @@ def _score_unknowns(base: Member, candidates: Sequence[Candidate]) -> dict[Candi
             price[width:] = np.log(factor.std)
     every, columns = tuple(range(len(layout.constants))), layout.subjects().items()
     own_states = tuple(column for subject, column in columns if subject in own and column < width)
-    shared = eliminate_states(equations.select(own_states, every))
+    alone = len(own_states) == width  # a copy of the equations of a swarm is large
+    shared = eliminate_states(equations if alone else equations.select(own_states, every))
 
     def evidence(names: Collection[Subject]) -> float:
         used = [column for subject, column in columns if subject in names]

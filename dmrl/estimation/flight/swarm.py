@@ -6,7 +6,7 @@ instead of in each pair. Error models are tried if the plain model does not fit.
 signals no model explains is left out, and the others are solved without it.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -25,7 +25,7 @@ from dmrl.estimation.flight.pair_solver import WindowSolution, consistent_views
 from dmrl.estimation.flight.pairs import MIN_PRIOR_CHANCE, MISFIT_GRADE
 from dmrl.estimation.flight.pieces import compute_prior_chance
 from dmrl.estimation.flight.swarm_output import Names, SwarmPart, estimate_directions
-from dmrl.estimation.flight.windows import carry_information, split_windows
+from dmrl.estimation.flight.windows import Window, carry_information, split_windows
 from dmrl.estimation.model.gate import DEFAULT_GATE, Gate
 from dmrl.estimation.model.odometry import rotate, rotation_matrix
 from dmrl.estimation.model.pair import Array, Pair
@@ -43,6 +43,7 @@ from dmrl.estimation.solver.problem import Problem
 from dmrl.estimation.solver.residuals import Values
 from dmrl.guards.memory import return_freed_memory
 
+Progress = Callable[[Sequence[Window]], Iterable[Window]]
 MIN_SHARED_SHARE = 0.95
 """Smallest share of the longest pair's time that all robots share. A robot that flies for a shorter
 time is left out, as the others would lose the rest of their flight."""
@@ -52,7 +53,11 @@ noise of a range."""
 
 
 def estimate_swarm(
-    pairs: Mapping[Names, Pair], starts: Mapping[Names, Estimate], *, gate: Gate = DEFAULT_GATE
+    pairs: Mapping[Names, Pair],
+    starts: Mapping[Names, Estimate],
+    *,
+    gate: Gate = DEFAULT_GATE,
+    progress: Progress = iter,
 ) -> dict[Names, Estimate]:
     """Estimate the robots of every group of three or more that ranges connect.
 
@@ -64,6 +69,8 @@ def estimate_swarm(
         Estimates of every ordered pair under the plain model.
     gate
         Gate of the positions.
+    progress
+        Shows the progress over the windows of a group.
 
     Returns
     -------
@@ -72,12 +79,16 @@ def estimate_swarm(
     """
     out: dict[Names, Estimate] = {}
     for group in (one for one in _find_groups(pairs) if len(one) > 2):
-        out |= _estimate_group({n: p for n, p in pairs.items() if n[0] in group}, starts, gate)
+        mine = {names: pair for names, pair in pairs.items() if names[0] in group}
+        out |= _estimate_group(mine, starts, gate, progress)
     return out
 
 
 def _estimate_group(
-    pairs: Mapping[Names, Pair], starts: Mapping[Names, Estimate], gate: Gate
+    pairs: Mapping[Names, Pair],
+    starts: Mapping[Names, Estimate],
+    gate: Gate,
+    progress: Progress,
 ) -> dict[Names, Estimate]:
     """Return the estimates of a group without the robots that no model explains."""
     if any(find_clock_shift(pair) for pair in pairs.values()):
@@ -86,12 +97,12 @@ def _estimate_group(
     left_out = _find_shortest_log(used)
     if left_out is None:
         mine = {names: starts[names] for names in starts if {*names} <= {*list_robots(pairs)}}
-        parts, fault = _solve_group(used, mine)
+        parts, fault = _solve_group(used, mine, progress)
         if fault is None:
             return estimate_directions(pairs, used, parts, gate)
         left_out = list_robots(pairs)[fault.robot or 0]
     rest = {names: pair for names, pair in pairs.items() if left_out not in names}
-    return estimate_swarm(rest, starts, gate=gate)
+    return estimate_swarm(rest, starts, gate=gate, progress=progress)
 
 
 def _find_shortest_log(pairs: Mapping[Names, Pair]) -> str | None:
@@ -128,13 +139,13 @@ def _find_groups(pairs: Mapping[Names, Pair]) -> list[set[str]]:
 
 
 def _solve_group(
-    pairs: Mapping[Names, Pair], starts: Mapping[Names, Estimate]
+    pairs: Mapping[Names, Pair], starts: Mapping[Names, Estimate], progress: Progress
 ) -> tuple[list[SwarmPart], Cause | None]:
     """Return the windows of one group, up to the first that no model explains, and its fault."""
     start_s = max(pair.time_s[0] for pair in pairs.values())
     end_s = min(pair.time_s[-1] for pair in pairs.values())
-    parts: list[SwarmPart] = []
-    for part in _solve_windows(pairs, starts, (start_s, end_s)):
+    windows, parts = list(split_windows(start_s, end_s)), list[SwarmPart]()
+    for part in _solve_windows(pairs, starts, progress(windows)):
         parts.append(part)
         if part.fault is not None:
             return parts, part.fault
@@ -142,12 +153,12 @@ def _solve_group(
 
 
 def _solve_windows(
-    pairs: Mapping[Names, Pair], starts: Mapping[Names, Estimate], shared_s: tuple[float, float]
+    pairs: Mapping[Names, Pair], starts: Mapping[Names, Estimate], windows: Iterable[Window]
 ) -> Iterator[SwarmPart]:
     """Solve all robots window by window."""
     carried: Carried | None = None
     names = list_robots(pairs)
-    for window in split_windows(*shared_s):
+    for window in windows:
         return_freed_memory()  # of the pairs, and of the window before
         cut = {both: pair.crop(window.start_s, window.end_s) for both, pair in pairs.items()}
         numbered = {(names.index(a), names.index(b)): pair for (a, b), pair in cut.items()}

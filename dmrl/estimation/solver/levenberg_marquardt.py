@@ -117,6 +117,7 @@ class Solver:
             try:
                 step = solve_step(equations.damped(damping))
                 tried = apply_step(values, step.state, step.constants, layout.robots)
+                del step  # its factor is as large as the equations
                 ahead = self.linearize(tried, layout)
                 cost = total_cost(ahead)
             except np.linalg.LinAlgError:
@@ -132,7 +133,8 @@ class Solver:
                 is_same_solution(values, other.values, same_m) for other in previous
             ):
                 break
-            equations = build_equations(layout, factors, len(values.state))
+            del equations  # before new ones of the same size are built
+            equations = build_equations(layout, factors, len(values.state))  # noqa: F841 - used
         return MapEstimate(values, best), factors
 
     def log_evidence(self, found: MapEstimate) -> float:
