@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from dmrl.estimation.evidence.clock_shifts import find_clock_shift
+from dmrl.estimation.evidence.clock_shifts import find_clock_shift, find_motion_shift
 from dmrl.estimation.evidence.delays import SIGNALS
 from dmrl.estimation.evidence.error_models import Candidate
 from dmrl.estimation.evidence.goodness_of_fit import FALSE_ALARM, check_fit
@@ -31,7 +31,7 @@ from dmrl.estimation.model.odometry import rotate, rotation_matrix
 from dmrl.estimation.model.pair import Array, Pair
 from dmrl.estimation.signals.contradictions import drop_contradictions, drop_held_ranges
 from dmrl.estimation.solver.camera_noise import calibrate_views
-from dmrl.estimation.solver.covariance import compute_covariance
+from dmrl.estimation.solver.covariance import Covariances, compute_covariance
 from dmrl.estimation.solver.estimate import Cause, Estimate
 from dmrl.estimation.solver.keyframes import (
     build_problem,
@@ -242,17 +242,32 @@ def _check_window(mixture: Mixture, time_s: Array, least_chance: float) -> Swarm
     fault = max(misfits, key=lambda one: one.to_s - one.from_s, default=None)
     if fault is not None and fault.robot is None:
         fault = replace(fault, robot=_find_worst_robot(best))
+    spread = [compute_covariance(one.solver, one.values) for one in mixture.members]
     # Only pairs are solved again with samples that are moved in time.
-    moved = next((one for one in best.models if _is_of_time(one)), None)
+    moved = next((one.robot for one in best.models if _is_of_time(one)), None)
+    moved = _find_moved_clock(best, spread[0]) if moved is None else moved
     if moved is not None:
-        fault = Cause(moved.model.name, 1.0, *ends, moved.robot)
+        fault = Cause("clock", 1.0, *ends, moved)
     elif fault is None and (
         problem.noise.grade >= MISFIT_GRADE
         or compute_prior_chance(problem, best.values) < least_chance
     ):
         fault = Cause("priors", 1.0, *ends, _find_worst_robot(best))
-    spread = [compute_covariance(one.solver, one.values) for one in mixture.members]
-    return SwarmPart(WindowSolution(mixture, [] if fault else spread), time_s, innovations, fault)
+    return SwarmPart(WindowSolution(mixture, spread), time_s, innovations, fault)
+
+
+def _find_moved_clock(best: Member, spread: Covariances) -> int | None:
+    """Return a robot whose clock is off, if only one robot of some pair ranges; else None."""
+    problem = best.solver.problem
+    if all(len(np.unique(link.sent)) > 1 or 0.0 < link.sent[0] < 1.0 for link in problem.links):
+        return None
+    for (_, own), row in problem.layout.constants:
+        if row.owner == "clock":
+            k = problem.layout.find(row.name, *own)
+            offset_s, variance = best.values.constants[[k]], spread.constants[[k], k]
+            if find_motion_shift(offset_s, variance, is_off=False):
+                return own[0]
+    return None
 
 
 def _find_worst_robot(best: Member) -> int:
