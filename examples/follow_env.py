@@ -47,10 +47,7 @@ class FollowEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
         return self._observe(self.simulation.reset(flight)["cf1"]), {}
 
     def step(self, action: np.ndarray) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
-        """Fly an action for 0.05 s.
-
-        The reward is highest, 1, where cf2 is straight ahead at DISTANCE_M.
-        """
+        """Fly an action for 0.05 s. The reward is 1 with cf2 straight ahead at DISTANCE_M."""
         seen = self.simulation.step({"cf1": (np.clip(action, -1, 1) * LIMITS).tolist()})["cf1"]
         x, y, z = self.simulation.peer_position("cf1", "cf2")
         distance = float(np.linalg.norm((x, y, z)))
