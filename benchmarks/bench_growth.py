@@ -24,6 +24,9 @@ from typing import Any
 import numpy as np
 from scipy.optimize import least_squares
 
+MIN_GROWTH = 0.2
+"""Smallest relative growth of the CPU time from the first length to the second that is fitted: one
+run repeats within a tenth."""
 READ = "import dmrl; rec = dmrl.open('flight.mcap'); [rec[name].to_arrow() for name in rec.topics]"
 WORK: Mapping[str, tuple[str, ...]] = {
     "fly": ("fly", "fly_in_view", "flight.mcap", "--camera", "--camera-rate-hz", "4"),
@@ -91,8 +94,11 @@ def measure(
 
 
 def fit_exponent(times: Sequence[int], cpu_s: Sequence[float]) -> float | None:
-    """Return k of the fit ``start + a times^k``, by relative error; None below three lengths."""
-    if len(times) < 3:
+    """Return k of the fit ``start + a times^k``, by relative error.
+
+    None is returned below three lengths, and where the start hides the growth of the first two.
+    """
+    if len(times) < 3 or cpu_s[1] < (1 + MIN_GROWTH) * cpu_s[0]:
         return None
     size, cost = np.array(times, float), np.array(cpu_s)
 
