@@ -47,6 +47,8 @@ Progress = Callable[[Sequence[Window]], Iterable[Window]]
 MIN_SHARED_SHARE = 0.95
 """Smallest share of the longest pair's time that all robots share. A robot that flies for a shorter
 time is left out, as the others would lose the rest of their flight."""
+MAX_MISFIT_SHARE = 0.1
+"""Largest share of a window that may not fit, and is refused. Beyond it the robot is left out."""
 MIN_RANGE_ERROR_M = 0.05
 """Temporary excess of a pair's ranges from which the joint solve estimates it too, metres: half the
 noise of a range."""
@@ -197,7 +199,7 @@ def _weigh_window(solver: Solver, found: MapEstimate, time_s: Array) -> SwarmPar
     constants = [one for one in listed if one.robot is not None and _is_constant(one)]
     mixture = weigh_models(solver, [found], candidates=constants)
     part = _check_window(mixture, time_s, FALSE_ALARM)
-    if part.fault is None and not mixture.members[0].models:
+    if part.fault is None and not part.misfits and not mixture.members[0].models:
         return part
     mixture = weigh_models(solver, [found], candidates=listed)
     tried = _check_window(mixture, time_s, MIN_PRIOR_CHANCE)
@@ -239,9 +241,11 @@ def _check_window(mixture: Mixture, time_s: Array, least_chance: float) -> Swarm
     ends = float(time_s[0]), float(time_s[-1])
     innovations, misfits = check_fit(best.solver, best.values, ends)
     problem = best.solver.problem
-    fault = max(misfits, key=lambda one: one.to_s - one.from_s, default=None)
-    if fault is not None and fault.robot is None:
-        fault = replace(fault, robot=_find_worst_robot(best))
+    fault = None
+    if sum(one.to_s - one.from_s for one in misfits) > MAX_MISFIT_SHARE * (ends[1] - ends[0]):
+        fault = max(misfits, key=lambda one: one.to_s - one.from_s)
+        robot = _find_worst_robot(best) if fault.robot is None else fault.robot
+        fault = replace(fault, robot=robot)
     spread = [compute_covariance(one.solver, one.values) for one in mixture.members]
     # Only pairs are solved again with samples that are moved in time.
     moved = next((one.robot for one in best.models if _is_of_time(one)), None)
@@ -253,7 +257,7 @@ def _check_window(mixture: Mixture, time_s: Array, least_chance: float) -> Swarm
         or compute_prior_chance(problem, best.values) < least_chance
     ):
         fault = Cause("priors", 1.0, *ends, _find_worst_robot(best))
-    return SwarmPart(WindowSolution(mixture, spread), time_s, innovations, fault)
+    return SwarmPart(WindowSolution(mixture, spread), time_s, innovations, misfits, fault)
 
 
 def _find_moved_clock(best: Member, spread: Covariances) -> int | None:

@@ -27,11 +27,15 @@ Names = tuple[str, str]
 
 
 class SwarmPart(NamedTuple):
-    """Window: its solutions under likely models, output times, and what no model explains."""
+    """Window: its solutions under likely models, and output times.
+
+    ``misfits`` are short stretches that do not fit, ``fault`` what spoils the whole window.
+    """
 
     solution: WindowSolution
     time_s: Array
     innovations: tuple[Innovation, ...]
+    misfits: tuple[Cause, ...]
     fault: Cause | None
 
 
@@ -92,7 +96,7 @@ def _select_pair(part: SwarmPart, both: tuple[int, int]) -> Estimate:
         height_std_m=interpolate_at(time_s, problem.keyframe_s, height_std),
         causes=tuple(
             replace(one, robot=None if one.robot is None else both.index(one.robot))
-            for one in find_causes(solution.mixture, ends)
+            for one in (*find_causes(solution.mixture, ends), *part.misfits)
             if one.robot is None or one.robot in both
         ),
         innovations=tuple(_select_innovations(part, both)),
