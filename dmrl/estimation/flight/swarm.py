@@ -99,7 +99,10 @@ def _estimate_group(
     left_out = _find_shortest_log(used)
     if left_out is None:
         mine = {names: starts[names] for names in starts if {*names} <= {*list_robots(pairs)}}
-        parts, fault = _solve_group(used, mine, progress)
+        try:
+            parts, fault = _solve_group(used, mine, progress)
+        except np.linalg.LinAlgError:  # the pairs may have a solution each
+            return {}
         if fault is None:
             return estimate_directions(pairs, used, parts, gate)
         left_out = list_robots(pairs)[fault.robot or 0]

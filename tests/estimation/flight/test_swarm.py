@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from itertools import combinations
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -163,6 +164,13 @@ def test_a_robot_that_no_model_explains_is_left_out() -> None:
     kept = np.concatenate([estimate.status == OK for estimate in swarm.values()])
     assert kept.mean() > 0.9
     assert (compute_errors(flight, swarm)[kept] > 0.3).mean() < 0.02
+
+
+def test_a_group_without_a_solution_is_left_to_its_pairs(monkeypatch: pytest.MonkeyPatch) -> None:
+    _, pairs, both, _ = solve_flight("random", "calibrated", duration_s=20.0)
+    unsolved = Mock(side_effect=np.linalg.LinAlgError)
+    monkeypatch.setattr("dmrl.estimation.flight.swarm._solve_group", unsolved)
+    assert estimate_swarm(pairs, both) == {}
 
 
 def test_a_robot_that_flies_for_a_shorter_time_is_left_out() -> None:
