@@ -266,7 +266,7 @@ def _check_window(mixture: Mixture, time_s: Array, least_chance: float) -> Swarm
 def _find_moved_clock(best: Member, spread: Covariances) -> int | None:
     """Return a robot whose clock is off, if only one robot of some pair ranges; else None."""
     problem = best.solver.problem
-    if all(len(np.unique(link.sent)) > 1 or 0.0 < link.sent[0] < 1.0 for link in problem.links):
+    if all(len(np.unique(link.sent)) != 1 or 0.0 < link.sent[0] < 1.0 for link in problem.links):
         return None
     for (_, own), row in problem.layout.constants:
         if row.owner == "clock":

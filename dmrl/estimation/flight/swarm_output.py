@@ -68,7 +68,9 @@ def _find_silence(
     pair: Pair, time_s: Array, parts: Sequence[SwarmPart], both: tuple[int, int]
 ) -> Mask:
     """Return (T,) whether sensors of a pair are silent or contradict the solution."""
-    silent: Mask = odometry_dropout(pair, time_s) | range_dropout(pair, time_s)
+    silent: Mask = odometry_dropout(pair, time_s)
+    if len(pair.range_m):  # two robots may be placed by the ranges of others
+        silent |= range_dropout(pair, time_s)
     for part in parts:
         problem, values = part.solution.problem, part.solution.values
         key_s, wrong = problem.keyframe_s, find_contradicted_steps(problem, values, both)
