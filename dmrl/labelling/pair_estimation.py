@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import chain
 from typing import Any, Literal
 
 from dmrl.estimation.flight.data_association import resolve_conflicts
@@ -13,7 +14,7 @@ from dmrl.estimation.model.pair import Pair
 from dmrl.estimation.solver.estimate import Estimate
 from dmrl.guards.memory import keep_freed_memory
 from dmrl.labelling.flight_log import RobotPair
-from dmrl.terminal.progress import track
+from dmrl.terminal.progress import say, track
 
 MAX_GROUP = 15
 """Most pairs that are filtered side by side: more are no faster, and need more memory."""
@@ -80,16 +81,28 @@ def estimate_all(
     workers, spread
         Most processes, and the function that runs them.
     """
-    together = {}
-    if solver.method == "swarm" and (connected := select_connected(pairs)):
-        starts = _estimate(connected, replace(solver, plain=True), workers, spread)
-        progress = partial(track, what="Solving together")
-        together = estimate_swarm(connected, starts, gate=solver.gate, progress=progress)
+    together = (
+        _estimate_together(pairs, solver, workers, spread) if solver.method == "swarm" else {}
+    )
     alone = {names: pair for names, pair in pairs.items() if names not in together}
     estimates = together | _estimate(alone, solver, workers, spread)
     if again := resolve_conflicts(pairs, estimates):
         estimates |= _estimate(again, solver, workers, spread)
     return dict(sorted(estimates.items()))
+
+
+def _estimate_together(
+    pairs: Mapping[RobotPair, Pair], solver: PairSolver, workers: int, spread: Spread
+) -> dict[RobotPair, Estimate]:
+    """Estimate the robots that ranges connect, and name those that are left out."""
+    connected = select_connected(pairs)
+    starts = _estimate(connected, replace(solver, plain=True), workers, spread)
+    progress = partial(track, what="Solving together")
+    together = estimate_swarm(connected, starts, gate=solver.gate, progress=progress)
+    if left_out := sorted({*chain(*connected)} - {*chain(*together)}):
+        why = "no error model fits them all, clocks disagree, or times of flight differ"
+        say(f"{', '.join(left_out)}: estimated pair by pair, as {why}")
+    return together
 
 
 def _estimate(
