@@ -18,9 +18,7 @@ from dmrl.estimation.evidence.goodness_of_fit import FALSE_ALARM, check_fit
 from dmrl.estimation.evidence.model_trials import Member
 from dmrl.estimation.evidence.noisy_stretch import sum_velocity_squares
 from dmrl.estimation.evidence.posterior import Mixture, list_shown, weigh_models
-from dmrl.estimation.flight.pair_output import (
-    output_times,
-)
+from dmrl.estimation.flight.pair_output import output_times
 from dmrl.estimation.flight.pair_solver import WindowSolution, consistent_views
 from dmrl.estimation.flight.pairs import MIN_PRIOR_CHANCE, MISFIT_GRADE
 from dmrl.estimation.flight.pieces import compute_prior_chance
@@ -29,14 +27,12 @@ from dmrl.estimation.flight.windows import Window, carry_information, split_wind
 from dmrl.estimation.model.gate import DEFAULT_GATE, Gate
 from dmrl.estimation.model.odometry import rotate, rotation_matrix
 from dmrl.estimation.model.pair import Array, Pair
+from dmrl.estimation.search.modes import convert_values
 from dmrl.estimation.signals.contradictions import drop_contradictions, drop_held_ranges
 from dmrl.estimation.solver.camera_noise import calibrate_views
 from dmrl.estimation.solver.covariance import Covariances, compute_covariance
-from dmrl.estimation.solver.estimate import Cause, Estimate
-from dmrl.estimation.solver.keyframes import (
-    build_problem,
-    list_robots,
-)
+from dmrl.estimation.solver.estimate import Estimate
+from dmrl.estimation.solver.keyframes import build_problem, list_robots
 from dmrl.estimation.solver.levenberg_marquardt import ROUGH_TOLERANCE, MapEstimate, Solver
 from dmrl.estimation.solver.priors import Carried
 from dmrl.estimation.solver.problem import Problem
@@ -105,7 +101,7 @@ def _estimate_group(
             return {}
         if fault is None:
             return estimate_directions(pairs, used, parts, gate)
-        left_out = list_robots(pairs)[fault.robot or 0]
+        left_out = list_robots(pairs)[fault]
     rest = {names: pair for names, pair in pairs.items() if left_out not in names}
     return estimate_swarm(rest, starts, gate=gate, progress=progress)
 
@@ -145,8 +141,8 @@ def _find_groups(pairs: Mapping[Names, Pair]) -> list[set[str]]:
 
 def _solve_group(
     pairs: Mapping[Names, Pair], starts: Mapping[Names, Estimate], progress: Progress
-) -> tuple[list[SwarmPart], Cause | None]:
-    """Return the windows of one group, up to the first that no model explains, and its fault."""
+) -> tuple[list[SwarmPart], int | None]:
+    """Return the windows of one group, up to the first that no model explains, and its robot."""
     start_s = max(pair.time_s[0] for pair in pairs.values())
     end_s = min(pair.time_s[-1] for pair in pairs.values())
     windows, parts = list(split_windows(start_s, end_s)), list[SwarmPart]()
@@ -170,9 +166,7 @@ def _solve_windows(
         problem = _with_pair_models(build_problem(numbered), names, starts)
         start = _first_guess(problem, names, starts)
         kept = replace(problem, views=consistent_views(problem, start))
-        if kept.layout.width != problem.layout.width:
-            start = _first_guess(kept, names, starts)
-        start = Values(start.state, np.zeros(len(kept.layout.constants)))
+        start = convert_values(start, problem.layout, kept.layout)
         solver = Solver(kept, carried)
         solver, found = calibrate_views(solver, solver.solve(start, tolerance=ROUGH_TOLERANCE))
         first = next(iter(pairs.values()))
@@ -209,7 +203,7 @@ def _weigh_window(solver: Solver, found: MapEstimate, time_s: Array) -> SwarmPar
     if tried.fault is None or part.fault is None:
         return tried
     # Models bend the solution, which hides the sensor that they stand for.
-    return tried._replace(fault=replace(tried.fault, robot=part.fault.robot))
+    return tried._replace(fault=part.fault)
 
 
 def _suits_swarm(one: Candidate) -> bool:
@@ -229,7 +223,7 @@ def _is_of_time(one: Candidate) -> bool:
 
 
 def _check_window(mixture: Mixture, time_s: Array, least_chance: float) -> SwarmPart:
-    """Return a window with the fault that its models leave.
+    """Return a window with the robot at fault, if its models do not explain it.
 
     Parameters
     ----------
@@ -244,22 +238,19 @@ def _check_window(mixture: Mixture, time_s: Array, least_chance: float) -> Swarm
     ends = float(time_s[0]), float(time_s[-1])
     innovations, misfits = check_fit(best.solver, best.values, ends)
     problem = best.solver.problem
-    fault = None
-    if sum(one.to_s - one.from_s for one in misfits) > MAX_MISFIT_SHARE * (ends[1] - ends[0]):
-        fault = max(misfits, key=lambda one: one.to_s - one.from_s)
-        robot = _find_worst_robot(best) if fault.robot is None else fault.robot
-        fault = replace(fault, robot=robot)
     spread = [compute_covariance(one.solver, one.values) for one in mixture.members]
     # Only pairs are solved again with samples that are moved in time.
-    moved = next((one.robot for one in best.models if _is_of_time(one)), None)
-    moved = _find_moved_clock(best, spread[0]) if moved is None else moved
-    if moved is not None:
-        fault = Cause("clock", 1.0, *ends, moved)
+    fault = next((one.robot for one in best.models if _is_of_time(one)), None)
+    fault = _find_moved_clock(best, spread[0]) if fault is None else fault
+    long = sum(one.to_s - one.from_s for one in misfits) > MAX_MISFIT_SHARE * (ends[1] - ends[0])
+    if fault is None and long:
+        fault = max(misfits, key=lambda one: one.to_s - one.from_s).robot
     elif fault is None and (
-        problem.noise.grade >= MISFIT_GRADE
-        or compute_prior_chance(problem, best.values) < least_chance
+        problem.noise.grade < MISFIT_GRADE
+        and compute_prior_chance(problem, best.values) >= least_chance
     ):
-        fault = Cause("priors", 1.0, *ends, _find_worst_robot(best))
+        return SwarmPart(WindowSolution(mixture, spread), time_s, innovations, misfits, None)
+    fault = _find_worst_robot(best) if fault is None else fault
     return SwarmPart(WindowSolution(mixture, spread), time_s, innovations, misfits, fault)
 
 

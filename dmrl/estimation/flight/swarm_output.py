@@ -29,14 +29,14 @@ Names = tuple[str, str]
 class SwarmPart(NamedTuple):
     """Window: its solutions under likely models, and output times.
 
-    ``misfits`` are short stretches that do not fit, ``fault`` what spoils the whole window.
+    ``misfits`` are stretches that do not fit, ``fault`` the robot that no model explains.
     """
 
     solution: WindowSolution
     time_s: Array
     innovations: tuple[Innovation, ...]
     misfits: tuple[Cause, ...]
-    fault: Cause | None
+    fault: int | None
 
 
 def estimate_directions(
@@ -47,20 +47,22 @@ def estimate_directions(
 ) -> dict[Names, Estimate]:
     """Return the estimates of both directions of all pairs of a group."""
     names, out = list_robots(logged), {}
-    for one, other in logged:
+    for (one, other), pair in used.items():
         both = names.index(one), names.index(other)
-        for side, turned in enumerate((both, both[::-1])):
-            seen = join_estimates([_select_pair(part, turned) for part in parts])
-            gaps = find_dropouts(logged[one, other], used[one, other])
-            gaps = tuple(cause.seen_from_peer() for cause in gaps) if side else gaps
-            seen = replace(seen, causes=(*gaps, *seen.causes))
-            silent = _find_silence(used[one, other], seen.time_s, parts, both)
-            energy = np.mean(
-                [motion_energy(p.solution.problem, p.solution.values, *turned) for p in parts],
-                axis=0,
-            )
-            label = (one, other) if not side else (other, one)
-            out[label] = with_status(seen, silent, (energy[0], energy[2]), gate)
+        sides = [
+            join_estimates([_select_pair(part, turned) for part in parts])
+            for turned in (both, both[::-1])
+        ]
+        silent = _find_silence(pair, sides[0].time_s, parts, both)
+        each = [motion_energy(p.solution.problem, p.solution.values, *both) for p in parts]
+        own, peer, relative = np.mean(each, axis=0)
+        gaps = find_dropouts(logged[one, other], pair)
+        seen_gaps = gaps, tuple(cause.seen_from_peer() for cause in gaps)
+        for label, seen, found, energy in zip(
+            ((one, other), (other, one)), sides, seen_gaps, (own, peer), strict=True
+        ):
+            seen = replace(seen, causes=(*found, *seen.causes))
+            out[label] = with_status(seen, silent, (energy, relative), gate)
     return out
 
 
