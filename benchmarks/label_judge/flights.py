@@ -222,6 +222,8 @@ class Eye:
         Standard deviation and time constant of a correlated relative depth error.
     unseen_share
         Share of spans of ``lasting_s`` in which the peer is never found.
+    too_far
+        Constant relative error of all depths.
     """
 
     pixel_px: float = 2.0
@@ -231,6 +233,7 @@ class Eye:
     lasting_share: float = 0.0
     lasting_s: float = 3.0
     unseen_share: float = 0.0
+    too_far: float = 0.0
 
 
 def look(logs: Logs, eye: Eye, rng: np.random.Generator) -> Logs:
@@ -248,7 +251,8 @@ def look(logs: Logs, eye: Eye, rng: np.random.Generator) -> Logs:
         shown &= draw_spans(rng, true_s, eye.lasting_s) >= eye.unseen_share
         lasting = eye.lasting_share * draw_walk(rng, true_s, eye.lasting_s)
         noisy = uv + rng.normal(0.0, eye.pixel_px, uv.shape)
-        away = depth * np.exp(rng.normal(0.0, eye.depth_share, len(depth)) + lasting)
+        scatter = rng.normal(0.0, eye.depth_share, len(depth))
+        away = (1 + eye.too_far) * depth * np.exp(scatter + lasting)
         found = []
         for k in range(len(true_s)):
             rows = [[*noisy[k], away[k], 0.8]] if shown[k] else []

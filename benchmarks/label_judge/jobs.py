@@ -108,6 +108,7 @@ EYES = {
     "lasting errors": (Eye(lasting_share=0.2, unseen_share=0.3), False),
     "half of the images wrong": (Eye(wrong=0.5), False),
     "ideal camera and ranges": (Eye(), True),
+    "depths 10 % too large, and ranges": (Eye(too_far=0.1), True),
 }
 
 

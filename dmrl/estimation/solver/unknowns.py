@@ -213,14 +213,15 @@ TABLE: tuple[Unknown, ...] = (
     Unknown("height_error", "m", 0.03, "robot", evolution="fading", time_s=4.0, height=1.0),
     Unknown("camera_azimuth", "rad", 0.03, "antenna", Cauchy(2.0), bearing=_aside),
     Unknown("camera_elevation", "rad", 0.1, "antenna", bearing=_upwards),
-    Unknown("camera_distance", "1", 0.3, "antenna", bearing=_farther),
+    Unknown("camera_distance", "1", 0.3, "antenna", Cauchy(2.0), bearing=_farther),
 )
 """The unknowns of a flight.
 
 Standard deviations are those of sensors that nobody calibrated: the constants of UWB modules and of
 optical flow on small drones (docs/flights.md, preset "realistic", rounded up). Losses: an offset, a
 gyroscope or a clock is mostly good and sometimes far off, so their priors have Cauchy tails at 1.5
-to 2 sigmas. So has the azimuth of a camera: a board that is plugged in points within two degrees.
+to 2 sigmas. So have the azimuth of a camera, as a board that is plugged in points within two
+degrees, and its distances, whose standard deviation a flight shows (`camera_noise`).
 A scale keeps a Gaussian prior: otherwise it could shrink the path to nothing."""
 
 MEASURED_CLOCK = replace(next(row for row in TABLE if row.name == "clock"), loss=Gaussian())

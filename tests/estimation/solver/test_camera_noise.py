@@ -9,7 +9,13 @@ import pytest
 from dmrl.estimation.flight.pair_solver import solve_pair
 from dmrl.estimation.model.pair import Array, BearingMeasurements
 from dmrl.estimation.solver import camera_noise
-from dmrl.estimation.solver.camera_noise import MIN_IMAGES, calibrate_views, count_repeated
+from dmrl.estimation.solver.camera_noise import (
+    MIN_CONSTANT_RATIO,
+    MIN_IMAGES,
+    calibrate_views,
+    count_repeated,
+    estimate_constant_error,
+)
 from dmrl.estimation.solver.keyframes import build_problem
 from dmrl.estimation.solver.levenberg_marquardt import MapEstimate, Solver
 from dmrl.estimation.solver.residuals import bearing_factor
@@ -69,6 +75,25 @@ def test_correlated_errors_count_once() -> None:
     shown = float(np.hypot(NOISE[2], lasting.std()))
     assert view.std[0, 0, 2] > 1.5 * shown
     assert view.std[0, 0, :2] == pytest.approx(NOISE[:2], rel=0.6)
+    # Distances may be wrong throughout by as much as they are for seconds.
+    assert known_distance_std(trusted) == pytest.approx(lasting.std(), rel=0.5)
+
+
+def known_distance_std(solver: Solver) -> float:
+    """Return the prior standard deviation of the constant error of the first robot's distances."""
+    return solver.problem.noise.known_std["camera_distance", (0,)]
+
+
+def test_distances_with_independent_errors_are_right_in_the_mean() -> None:
+    trusted, best = calibrate_views(*solve_seen())
+    assert known_distance_std(trusted) == pytest.approx(MIN_CONSTANT_RATIO, abs=0.02)
+    column = [name for (name, _), _ in trusted.layout.constants].index("camera_distance")
+    assert abs(best.values.constants[column]) < MIN_CONSTANT_RATIO
+
+
+def test_constant_error_is_as_large_as_the_lasting_part() -> None:
+    assert estimate_constant_error(0.1, 1.0) == MIN_CONSTANT_RATIO
+    assert estimate_constant_error(0.1, 50.0) == pytest.approx(0.101, abs=1e-3)
 
 
 def test_few_images_keep_their_noise() -> None:
