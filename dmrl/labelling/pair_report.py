@@ -51,6 +51,7 @@ REMEDIES = {
     "sensors": "Or do odometry and ranges contradict each other? Check the signs and frames of "
     "both robots: docs/own_robot.md",
     "bearing": "Fly longer and faster, with turns, or with a third robot",
+    "odometry": "Fly slower, over a lit floor with texture, or with a third robot",
     "positions": "A wider --gate-m takes more: see docs/labelling.md",
     "robots": "Fly different ways, or exchange the names of the robots",
 }

@@ -5,6 +5,7 @@ import numpy as np
 from dmrl.estimation.model.pair import Array, Mask
 from dmrl.estimation.solver.levenberg_marquardt import Solver
 from dmrl.estimation.solver.priors import Chain
+from dmrl.estimation.solver.problem import Steps
 from dmrl.estimation.solver.residuals import Rows, Values
 
 WINDOW_S = 2.0
@@ -14,6 +15,10 @@ FREEDOM = 4.0
 values that the ranges determine."""
 RATIOS = (4.0, 16.0, 64.0)
 """Ratios of the variance in a stretch to that elsewhere that are compared."""
+
+MIN_LOG_RATIO = 2.0
+"""Smallest ratio of the squared changes of the logged velocity in a stretch to those elsewhere:
+half of the smallest ratio of variances that is compared."""
 
 
 def find_noisy_steps(
@@ -42,7 +47,23 @@ def find_noisy_steps(
     quiet = level / max(float(np.median(level)), 1e-12)
     paths = [_decode_levels(quiet, ratio) for ratio in RATIOS]
     gain, noisy = max(paths, key=lambda one: one[0])
-    return noisy[window] if gain > least_gain else None
+    steps = solver.problem.robots[robot]
+    if gain <= least_gain or not _shows_noise(steps, noisy[window]):
+        return None
+    return noisy[window]
+
+
+def _shows_noise(steps: Steps, noisy: Mask) -> bool:
+    """Return whether the log itself is noisier in a stretch than elsewhere.
+
+    An error that lasts, such as the log of another flight, contradicts the ranges as noise does,
+    but it changes no faster than the motion.
+    """
+    velocity = steps.motion.shift_m / steps.steps_s[:, None]
+    square, inside = (np.diff(velocity, 2, axis=0) ** 2).sum(axis=1), noisy[1:-1]
+    if inside.all() or not inside.any():
+        return False
+    return bool(np.median(square[inside]) > MIN_LOG_RATIO * np.median(square[~inside]))
 
 
 def sum_velocity_squares(solver: Solver, values: Values, robot: int) -> Array:

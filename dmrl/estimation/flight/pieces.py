@@ -47,16 +47,14 @@ class Piece(NamedTuple):
 
     ``silent`` (K,) dropouts of odometry or contradictory odometry, ``sighted`` (2, K) consistent
     images of either robot nearby, ``energy`` (3,) mean squares of the own, peer and relative
-    velocity without noise, relative to that noise; ``noisy`` (K,) odometry that is noisier than
-    elsewhere, ``chance`` the probability of larger constants by their priors, ``delay`` of a signal
-    that is probably late.
+    velocity without noise, relative to that noise; ``chance`` the probability of larger constants
+    by their priors, ``delay`` of a signal that is probably late.
     """
 
     estimate: Estimate
     silent: Mask
     sighted: Mask
     energy: Array
-    noisy: Mask
     chance: float = 1.0
     delay: Delay | None = None
 
@@ -123,13 +121,12 @@ def _to_piece(
         causes=find_causes(solution.mixture, (float(time_s[0]), float(time_s[-1]))),
     )
     step = np.clip(np.searchsorted(key_s, time_s, "right") - 1, 0, len(key_s) - 2)
-    noisy = problem.list_noisy_steps()[step]
-    silent = odometry_dropout(pair, time_s) | noisy
+    silent = odometry_dropout(pair, time_s) | problem.list_noisy_steps()[step]
     silent |= find_contradicted_steps(problem, values)[step]
     sighted, energy = list_sighted(solution, time_s), motion_energy(problem, values)
     chance = compute_prior_chance(problem, values)
     delay = find_delay(solution.mixture, covariances.constants, late)
-    return Piece(estimate, silent, sighted, energy, noisy, chance, delay)
+    return Piece(estimate, silent, sighted, energy, chance, delay)
 
 
 def compute_prior_chance(problem: Problem, values: Values) -> float:
@@ -204,5 +201,4 @@ def join_pieces(pieces: Sequence[Piece]) -> Piece:
     first = _first_samples([piece.estimate for piece in pieces])
     silent = np.concatenate([p.silent[k:] for p, k in zip(pieces, first, strict=True)])
     sighted = np.concatenate([p.sighted[:, k:] for p, k in zip(pieces, first, strict=True)], axis=1)
-    noisy = np.concatenate([p.noisy[k:] for p, k in zip(pieces, first, strict=True)])
-    return Piece(made, silent, sighted, np.mean([p.energy for p in pieces], axis=0), noisy)
+    return Piece(made, silent, sighted, np.mean([p.energy for p in pieces], axis=0))

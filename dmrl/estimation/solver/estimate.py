@@ -25,6 +25,8 @@ REASONS = {
 """Names of the reasons why no position of a flight is OK."""
 MISFIT = "does not fit"
 """End of the name of a cause that refuses its stretch: a signal that no error model explains."""
+TOO_NOISY = "odometry is too noisy"
+"""Name of a cause that refuses its stretch: constants cannot be told from such noise."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +54,7 @@ class Cause:
     @property
     def refuses(self) -> bool:
         """Whether no position of its stretch may be OK."""
-        return self.name.endswith(MISFIT)
+        return self.name.endswith(MISFIT) or self.name == TOO_NOISY
 
     def seen_from_peer(self) -> "Cause":
         """Return the cause with observer and peer exchanged."""

@@ -102,7 +102,6 @@ def test_models_without_gain_are_not_solved_after_a_leading_one(
 def test_quiet_flight_has_no_noisy_stretch() -> None:
     base = solve_plain(build_pair(simulate_flight("in_view", "calibrated", 1000, 40.0)))
     assert [find_noisy_steps(base.solver, base.values, robot) for robot in (0, 1)] == [None, None]
-    assert find_noisy_steps(base.solver, base.values, 0, -1.0) is not None
 
 
 def test_levels_are_decoded_to_the_ends_of_the_flight() -> None:
@@ -132,6 +131,24 @@ def test_temporary_noise_is_found_and_widens_only_its_stretch() -> None:
     inside = (middle_s > 20) & (middle_s < 35)
     assert noisy[inside].mean() > 0.7 and noisy[~inside].mean() < 0.15
     assert problem.noise.grade < base.solver.problem.noise.grade
+
+
+@pytest.mark.heavy
+def test_a_stretch_of_another_log_is_not_noise() -> None:
+    pair = build_pair(simulate_flight("room", "calibrated", 1003, 60.0))
+    other = build_pair(simulate_flight("room", "calibrated", 1004, 60.0)).peer
+    where = (pair.time_s > 20) & (pair.time_s < 35)
+    vx, vy = (
+        np.where(where, getattr(other, name), getattr(pair.peer, name))
+        for name in ("vx_mps", "vy_mps")
+    )
+    base = solve_plain(replace(pair, peer=replace(pair.peer, vx_mps=vx, vy_mps=vy)))
+    square = noisy_stretch.sum_velocity_squares(base.solver, base.values, 1)
+    middle_s = base.solver.problem.keyframe_s[1:]
+    inside = (middle_s > 20) & (middle_s < 35)
+    assert square[inside].mean() > 3 * square[~inside].mean()  # the ranges contradict it
+    for robot in (0, 1):
+        assert not try_model(base, Candidate(FOR_A_WHILE, robot))
 
 
 def test_velocity_errors_count_coloured_noise_of_their_robot_alone() -> None:

@@ -18,6 +18,7 @@ from dmrl.estimation.solver.covariance import Covariances
 from dmrl.estimation.solver.estimate import (
     PAIR_LAYOUT,
     REASONS,
+    TOO_NOISY,
     Estimate,
     seen_from_peer,
     transform_to_peer,
@@ -160,6 +161,23 @@ def test_unobservable_bearing_is_ambiguous_in_other_flights(
 ) -> None:
     (estimate, _) = solved(trajectory, noise, seed)
     assert (estimate.status == room.AMBIGUOUS).mean() > 0.9
+
+
+@pytest.mark.heavy
+@pytest.mark.parametrize("seed", [1001, 1003])
+def test_harsh_noise_is_refused_by_its_name(seed: int) -> None:
+    for estimate in solved("in_view", "harsh", seed):
+        assert not (estimate.status == room.OK).any()
+        assert TOO_NOISY in {cause.name for cause in estimate.causes}
+
+
+@pytest.mark.heavy
+def test_a_flight_that_nothing_explains_is_refused() -> None:
+    pair = build_pair(simulate_flight("in_view", "calibrated", 1001, LONG_S))
+    long = pair.range_m + 0.4 * (pair.range_time_s.astype(int) % 2)  # every other second
+    for estimate in estimate_pairs([replace(pair, range_m=long)])[0]:
+        assert not (estimate.status == room.OK).any()
+        assert any(cause.refuses for cause in estimate.causes)
 
 
 @pytest.mark.heavy
