@@ -39,7 +39,7 @@ EVOLUTIONS = {
 LOSSES = {
     "range_offset": Cauchy(1.5), "gyro_bias": Cauchy(2.0), "clock": Cauchy(2.0),
     "velocity_error_x": Cauchy(5.0), "velocity_error_y": Cauchy(5.0), "range_error": Cauchy(1.0),
-    "camera_azimuth": Cauchy(2.0),
+    "camera_azimuth": Cauchy(2.0), "camera_distance": Cauchy(2.0),
 }  # fmt: skip
 
 
