@@ -64,6 +64,12 @@ class ErrorModel:
     sudden: bool = False
     log_odds: float = RARE
 
+    @property
+    def scales_motion(self) -> bool:
+        """Whether it scales measured motion, so that only a robot that moves shows it."""
+        scales = (_scale_shift, _by_height)
+        return any(row.motion_scale or row.motion in scales for row in self.rows)
+
     def owners(self, robots: int) -> tuple[int | None, ...]:
         """Return which of some robots may have the sensor; None: all ranges, or the flight."""
         every = tuple(range(robots))

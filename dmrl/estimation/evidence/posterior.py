@@ -119,10 +119,7 @@ def list_shown(problem: Problem) -> list[Candidate]:
         for one in list_candidates(len(problem.robots))
         if not (coarse and one.model.sudden)
         and not (ranged and any(row.name == "clock_free" for row in one.model.rows))
-        and (
-            not any(row.motion_scale for row in one.model.rows)
-            or (any(moves) if one.robot is None else moves[one.robot])
-        )
+        and (not one.model.scales_motion or (any(moves) if one.robot is None else moves[one.robot]))
     ]
 
 

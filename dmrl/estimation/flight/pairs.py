@@ -116,7 +116,7 @@ def _estimate_pair(
         logged, pair, pieces, shift = _move_clock(logged, pair, pieces, known)
         shifts += [shift] if shift else []
     logged, pair, pieces, late = _move_late(logged, pair, pieces)
-    if not any(map(_is_explained, pieces)):
+    if not blind and not any(map(_is_explained, pieces)):
         mistakes = []  # with the correction, it does not fit either
     mistakes += [_to_cause(one.model.name, pair, one.robot) for one in late]
     moved = [_to_cause(shift.name, logged, 1, shift.from_s) for shift in shifts]
