@@ -47,10 +47,8 @@ def find_noisy_steps(
     quiet = level / max(float(np.median(level)), 1e-12)
     paths = [_decode_levels(quiet, ratio) for ratio in RATIOS]
     gain, noisy = max(paths, key=lambda one: one[0])
-    steps = solver.problem.robots[robot]
-    if gain <= least_gain or not _shows_noise(steps, noisy[window]):
-        return None
-    return noisy[window]
+    steps, found = solver.problem.robots[robot], np.asarray(noisy[window])
+    return found if gain > least_gain and _shows_noise(steps, found) else None
 
 
 def _shows_noise(steps: Steps, noisy: Mask) -> bool:
