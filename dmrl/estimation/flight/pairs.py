@@ -126,13 +126,20 @@ def _estimate_pair(
         replace(one, status=np.maximum(one.status, np.int8(UNCONVERGED * (side in blind))))
         for side, one in enumerate(_both_directions(pair, pieces, gate))
     )
+    return _add_log_causes(own, peer, gaps, shifts)
+
+
+def _add_log_causes(
+    own: Estimate, peer: Estimate, found: Sequence[Cause], shifts: Sequence[ClockShift]
+) -> tuple[Estimate, Estimate]:
+    """Return both directions with the causes found in the logs, and the times that were logged."""
     return (
-        replace(own, causes=_add_causes(gaps, own.causes)),
+        replace(own, causes=_add_causes(found, own.causes)),
         replace(
             peer,
             # The second robot's positions and images have the times of its own clock.
             time_s=_to_log_times(peer.time_s, shifts),
-            causes=_add_causes([cause.seen_from_peer() for cause in gaps], peer.causes),
+            causes=_add_causes([cause.seen_from_peer() for cause in found], peer.causes),
         ),
     )
 
